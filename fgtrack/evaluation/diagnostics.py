@@ -123,8 +123,8 @@ def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)
         text = (
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, errors are "
-            f"{factor:.2g} times as large; `fgtrack advise{of_run} --tune -o advised.yaml` fits the noise, or reports "
-            "the problem to solve first"
+            f"{factor:.2g} times as large as configured; `fgtrack advise{of_run} --tune -o advised.yaml` fits the "
+            "noise, or reports the problem to solve first"
         )
         yield Diagnostic(sensor, text)
 

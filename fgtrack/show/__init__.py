@@ -1,1 +1,1 @@
-"""Runs to look at: figures, the HTML report, and files for Foxglove, RViz and maps."""
+"""Presentation of runs: figures, the HTML report, and files for Foxglove, RViz and maps."""

@@ -1,4 +1,4 @@
-"""Runs into a file that a viewer opens."""
+"""Export of runs to a file for a viewer."""
 
 from collections.abc import Iterator, Mapping
 from heapq import merge
@@ -29,11 +29,14 @@ def export(
 ) -> tuple[dict[str, int], list[str]]:
     """Write `runs` of one recording to `out`: an MCAP file for Foxglove, or with `ros2` a rosbag2 recording.
 
-    Log times are those at which something was known (receipt, tick), publish times and header stamps those that it is
-    about. Several runs stand side by side, the topics of each below its name. Returns the number of messages by topic,
-    and a line for whatever could not be shown. Raises `CallError` if the runs are not of the same recording, the
-    package `foxglove-sdk` is missing, or `out` is no name for the file, exists or lies in a run, and `DataError` if a
-    run or its map is damaged, or a time does not fit into the file.
+    The log time of a message is the time at which its content was available (receipt or
+    tick). Publish time and header stamp are the time of the content. Topics of several
+    runs begin with the name of the run. Returns the number of messages by topic, and a
+    line for each content that cannot be shown.
+
+    Raises `CallError` for runs of different recordings, without the package
+    `foxglove-sdk`, or if `out` is an invalid name, exists, or lies in a run. Raises
+    `DataError` if a run or its map is damaged, or a time does not fit into the file.
     """
     if not ros2:
         try:
@@ -43,7 +46,7 @@ def export(
             raise CallError(text) from error
         if out.suffix != ".mcap":
             raise CallError(
-                f"{out}: viewers recognise such a file by its name, let it end in .mcap"
+                f"{out}: viewers recognise the format by the suffix, use a name that ends in .mcap"
             )
     (check_output if out.suffix == ".mcap" else check_bag)(out, overwrite)
     every = evaluated(runs)
@@ -57,14 +60,17 @@ def export(
 def viewer_messages(
     runs: Mapping[str, Run],
 ) -> tuple[Iterator[ViewerMessage], list[str]]:
-    """Messages that show `runs`, by name, in the order of log times, and a line for whatever cannot be shown."""
+    """Return the messages that show `runs`, in order of log times, and a line for each content that cannot be shown.
+
+    The keys of `runs` are their names.
+    """
     (label, first), *others = runs.items()
     for name, run in others:
         if not same_recording(first, run) or not run.tables["ego"].equals(
             first.tables["ego"]
         ):  # the file has one ego
             raise CallError(
-                f"{label} and {name} are of different recordings, export each to a file of its own"
+                f"{label} and {name} come from different recordings, export each to its own file"
             )
     at_ns = start_ns(first)
     maps, notes = roads(first)
@@ -79,7 +85,11 @@ def viewer_messages(
 
 
 def _layers(runs: Mapping[str, Run]) -> list[RunLayer]:
-    """One run alone has the topics for itself; of several, each has a name before its topics, and a colour."""
+    """Return a layer for each run.
+
+    A single run has topics without prefix. Each of several runs has a topic prefix and
+    a colour.
+    """
     if len(runs) == 1:
         return [RunLayer()]
     names: list[str] = []

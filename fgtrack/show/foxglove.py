@@ -1,4 +1,8 @@
-"""Writes MCAP files for Foxglove and Lichtblick: log time is when something was known, publish time its stamp."""
+"""Writer of MCAP files for Foxglove and Lichtblick.
+
+The log time of a message is the time at which its content was available; the publish
+time is its stamp.
+"""
 
 import json
 import math
@@ -24,7 +28,7 @@ _SOLIDS = {
     "cylinder": sdk.CylinderPrimitive,
     "sphere": sdk.SpherePrimitive,
 }
-#: The rows of `updates.csv` have no message of Foxglove's own.
+#: Schema of the rows of `updates.csv`, for which Foxglove has no message type.
 _OUTCOME = {
     "title": "fgtrack.Outcome",
     "type": "object",
@@ -46,10 +50,11 @@ def write_foxglove(
     overwrite: bool = False,
     origin_deg: tuple[float, float] | None = None,
 ) -> dict[str, int]:
-    """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
-    With an origin, positions are also fixes, for map panels. The file appears when it is complete. The same messages
-    give the same bytes. Raises `CallError` if something is at `path`, and `DataError` if the disk is full or a time
-    lies before 1970.
+    """Write `messages`, in order of log times, to the MCAP file `path`; return their number by topic.
+
+    With `origin_deg`, positions are also written as fixes for map panels. The file
+    appears when it is complete. Equal messages give equal bytes. Raises `CallError` if
+    `path` exists, and `DataError` if the disk is full or a time lies before 1970.
     """
     channels: dict[str, int] = {}
     counts: Counter[str] = Counter()
@@ -59,7 +64,7 @@ def write_foxglove(
         for message in messages:
             if (early_ns := min(message.log_ns, message.stamp_ns)) < 0:
                 raise DataError(
-                    f"the time {early_ns} ns lies before 1970, which no MCAP file holds"
+                    f"the time {early_ns} ns lies before 1970, which an MCAP file cannot contain"
                 )
             for topic, value in values(message, origin_deg):
                 is_own = isinstance(value, dict)
@@ -96,7 +101,7 @@ def write_foxglove(
 def values(
     message: ViewerMessage, origin_deg: tuple[float, float] | None = None
 ) -> Iterator[tuple[str, Any]]:  # Any: messages of Foxglove, which share no type
-    """Topics, and what is written to them of `message`."""
+    """Yield each topic of `message` with the Foxglove message for it."""
     topic = message.topic
     sec, nsec = divmod(message.stamp_ns, NS_PER_S)
     time = sdk.Timestamp(sec, nsec)
@@ -111,7 +116,8 @@ def values(
             ]
             yield topic, sdk.SceneUpdate(deletions=deletions, entities=shown)
         case EgoState() as ego:
-            position, turn = _vector(ego.x_m, ego.y_m), _turn(ego.yaw_rad)
+            position = _vector(ego.x_m, ego.y_m)
+            turn = _turn(ego.yaw_rad)
             frames = {"parent_frame_id": "map", "child_frame_id": "ego"}
             yield (
                 "/tf",
@@ -146,7 +152,11 @@ def values(
 
 
 def _entity(entity: Entity, time: sdk.Timestamp, late_ns: int) -> sdk.SceneEntity:
-    """By the schema a lifetime counts from the stamp, in viewers from the log time: it is long enough for both."""
+    """Return the Foxglove entity.
+
+    The schema counts a lifetime from the stamp, but viewers count it from the log time.
+    The lifetime is long enough for both.
+    """
     lists: dict[str, list[Any]] = {}  # Any: primitives share no type
     lifetime_ns = (
         0
@@ -195,7 +205,7 @@ def _fixes(
     time: sdk.Timestamp,
     origin_deg: tuple[float, float] | None,
 ) -> list[sdk.LocationFix]:
-    """Positions on Earth; none without an origin."""
+    """Return the positions as fixes on Earth; empty without an origin."""
     if origin_deg is None or not points_m:
         return []
     pairs = zip(

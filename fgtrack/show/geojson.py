@@ -1,4 +1,4 @@
-"""Tracks of a run on Earth: GeoJSON (RFC 7946) for maps, or tracks.csv with latitude and longitude."""
+"""Export of the tracks of a run on Earth: GeoJSON (RFC 7946), or tracks.csv with latitude and longitude."""
 
 import json
 from itertools import groupby
@@ -13,24 +13,27 @@ from fgtrack.inputs.geodetic import GEODETIC, latitudes_longitudes_deg
 from fgtrack.runs import Run
 from fgtrack.show.states import located
 
-_DIGITS = 7  # a centimetre
+_DIGITS = 7  # of a degree: about a centimetre
 
 
 def origin_of(run: Run) -> tuple[float, float] | None:
-    """Latitude and longitude of the origin of the map of `run`; None where it is not known."""
+    """Latitude and longitude of the map origin of `run`; None if unknown."""
     origin = run.meta.get("origin")
     return None if origin is None else (origin[GEODETIC[0]], origin[GEODETIC[1]])
 
 
 def write_geojson(run: Run, out: Path, *, overwrite: bool = False) -> int:
-    """Write the tracks of `run` to `out` and return their number; a file `.csv` gets the table, others GeoJSON.
-    A feature is a line of one track: its id, class and identity, and of each point the time in s since the first tick.
-    Raises `CallError` for a run without an origin.
+    """Write the tracks of `run` to `out` and return their number.
+
+    A `.csv` file gets the table of the tracks, any other file GeoJSON. A GeoJSON
+    feature is the line of one track. Its properties are id, class, identity, and the
+    time of each point in s since the first tick. Raises `CallError` for a run without
+    an origin.
     """
     origin_deg = origin_of(run)
     if origin_deg is None:
         raise CallError(
-            f"{run.path}: has no latitude and longitude; set `input.origin` of the map and repeat the run"
+            f"{run.path}: the map has no latitude and longitude; set `input.origin` and repeat the run"
         )
     check_output(out, overwrite)
     check_no_overlap(out, [run.path])

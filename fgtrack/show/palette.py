@@ -1,4 +1,4 @@
-"""Colours of figures, reports and viewers: an estimator has the same one everywhere, by its name."""
+"""Colours of figures, reports and viewers. An estimator has the same colour everywhere."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -12,9 +12,9 @@ _BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED = (
     "#2F93C6",
     "#D1495B",
 )
-#: Distinguishable by the colour-blind; each has a contrast of 3 or more to a white and to a dark page (WCAG 2.1).
+#: Distinguishable with colour blindness. Each has a contrast of 3 or more on white and dark pages (WCAG 2.1).
 PALETTE = (_BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED)
-#: Of the sensors of a recording in order of their names: none is the colour of a common estimator.
+#: Colours of the sensors of a recording, by order of name. None is the colour of a common estimator.
 SENSORS = (_PURPLE, "#8C7A1F", "#6F6F6F", "#A0622D", _SKY)
 _LINES = ("-", "--", "-.", ":")
 _MARKERS = "os^vDP"
@@ -28,7 +28,7 @@ class CurveStyle(NamedTuple):
     marker: str
 
 
-#: Those that are compared most. A dashed line on a solid one shows both where two estimators tie.
+#: Styles of the common estimators. Where two curves coincide, a dashed line above a solid line shows both.
 _ESTIMATORS: Mapping[str, CurveStyle] = {
     "smoother": CurveStyle(_BLUE, "-", "o"),
     "smoother-batch": CurveStyle(_BLUE, "-.", "o"),
@@ -43,7 +43,7 @@ _ESTIMATORS: Mapping[str, CurveStyle] = {
 
 
 def style_of(estimator: str) -> CurveStyle:
-    """Return the style of the curves of `estimator`; of an unknown one always the same."""
+    """Return the curve style of `estimator`; an unknown name always gets the same style."""
     number = crc32(estimator.encode())
     unknown = CurveStyle(
         (_PURPLE, _SKY)[number % 2],
@@ -54,7 +54,7 @@ def style_of(estimator: str) -> CurveStyle:
 
 
 def styles(estimators: Sequence[str]) -> list[CurveStyle]:
-    """Return a style for each of `estimators`, in their order; equal colours get different lines."""
+    """Return a curve style for each of `estimators`, in their order; equal colours get different lines."""
     result: list[CurveStyle] = []
     for item in map(style_of, estimators):
         taken = [other.line for other in result if other.colour == item.colour]
@@ -70,7 +70,7 @@ def styles(estimators: Sequence[str]) -> list[CurveStyle]:
 
 
 def distinct_colours(estimators: Sequence[str]) -> list[str]:
-    """Return one colour for each of `estimators`: its own, or if that is taken a free one of the palette."""
+    """Return a colour for each of `estimators`: its own, or a free colour of the palette if it is already used."""
     result: list[str] = []
     for own in (style_of(name).colour for name in estimators):
         result.append(

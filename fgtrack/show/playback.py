@@ -1,4 +1,4 @@
-"""JSON values that the viewer of a report plays: recordings (map, ego, truth) and the runs of them."""
+"""JSON values for the viewer of a report: recordings (map, ego, truth) and their runs."""
 
 import math
 from collections.abc import Sequence
@@ -26,22 +26,26 @@ from fgtrack.show.states import (
 )
 
 MOST_ROWS = 60_000
-"""Rows of a table that the viewer shows of all runs together; of more every second time, every third ..."""
+"""Largest number of table rows in the viewer, for all runs together; a larger table is thinned."""
 
 Json = dict[str, Any]  # Any: JSON values
 Moment = tuple[int, float, float]
-"""Time in ns and position in the map that the viewer shows first."""
+"""Time [ns] and map position that the viewer shows first."""
 
-_TIME_DIGITS, _DIGITS = 4, 3  # of seconds; of metres and radians
-_LONGEST_S = 1e7  # times farther from the start are of another clock, and left out
+# Decimal digits of seconds, and of metres and radians.
+_TIME_DIGITS = 4
+_DIGITS = 3
+# Times farther from the start come from another clock and are excluded.
+_LONGEST_S = 1e7
 
 
 def playback(
     runs: Sequence[EvaluatedRun], moment: Moment | None = None
 ) -> tuple[Json, list[str]]:
-    """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
-    Times are seconds from the start of a recording, and missing values null. Raises `DataError` if a run or its map is
-    damaged.
+    """Return the content of the viewer for `runs`, and a line for each content that it does not show.
+
+    `moment` is shown first. Times are seconds from the start of the recording, and
+    missing values are null. Raises `DataError` if a run or its map is damaged.
     """
     recordings = [
         _Recording(group, min(start_ns(item.run) for item in group))
@@ -79,7 +83,7 @@ def playback(
 
 @dataclass(frozen=True)
 class _Recording:
-    """Runs of one recording, and the time that theirs are relative to."""
+    """Runs of one recording, with the start of their time axis."""
 
     runs: Sequence[EvaluatedRun]
     start_ns: int
@@ -89,14 +93,14 @@ class _Recording:
         return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
 
     def rows(self, states: Columns, time: str, *order: str) -> Columns:
-        """Rows of `states` with a position and a time, in the order of `time` and `order`."""
+        """Return the rows of `states` with a position and a time, sorted by `time` and `order`."""
         states = located(states)
         states = states.where(np.isfinite(self.seconds(states[time])))
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
         return Columns({name: values[keys] for name, values in states.items()})
 
     def columns(self, states: Columns, time: str) -> Json:
-        """Times and poses of rows, and where they have covariances the half axes of their 95 % ellipses."""
+        """Return times and poses of rows, and the half axes of their 95 % ellipses if they have covariances."""
         columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS)}
         columns |= {name: _column(states[f"{name}_m"]) for name in "xy"}
         if "yaw_rad" in states:
@@ -110,7 +114,7 @@ class _Recording:
         return columns
 
     def values(self, notes: dict[str, None], most: int) -> Json:
-        """Map, ego and truth."""
+        """Return map, ego and truth."""
         run = self.runs[0].run
         maps, gone = roads(run)
         notes.update(dict.fromkeys(gone))
@@ -119,10 +123,8 @@ class _Recording:
             for road in maps.values()
             for kind, line in zip(_LINES, road_lines(road), strict=True)
         ]
-        ego, truth = (
-            run.tables["ego"],
-            run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID),
-        )
+        ego = run.tables["ego"]
+        truth = run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
         (ego,) = _thinned([self.rows(ego, "stamp_ns")], "stamp_ns", most, "ego", notes)
         (truth,) = _thinned(
             [self.rows(truth, "stamp_ns", "object_id")],
@@ -132,9 +134,8 @@ class _Recording:
             notes,
         )
         return {
-            "start_ns": str(
-                self.start_ns
-            ),  # of more digits than a number of JavaScript holds
+            # A text, because a number of JavaScript has too few digits.
+            "start_ns": str(self.start_ns),
             "map": [{"kind": kind, **_place(line)} for kind, line in lines],
             "ego": self.columns(ego, "stamp_ns"),
             "truth": {
@@ -144,12 +145,10 @@ class _Recording:
         }
 
     def run(self, one: EvaluatedRun, notes: dict[str, None], most: int) -> Json:
-        """Ticks, tracks, their past at every tick, final states and detections."""
-        tables, lagged, smoothed = (
-            one.run.tables,
-            one.run.tables["lagged"],
-            one.run.tables["smoothed"],
-        )
+        """Return ticks, tracks, the past of the tracks at every tick, final states and detections."""
+        tables = one.run.tables
+        lagged = tables["lagged"]
+        smoothed = tables["smoothed"]
         past = self.rows(
             lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns"
         )
@@ -180,17 +179,17 @@ class _Recording:
         }
 
     def detections(self, run: Run) -> Json:
-        """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), position, track."""
-        table, updates, where, rows = (
-            run.tables["detections"],
-            run.tables["updates"],
-            placed(run),
-            update_rows(run),
-        )
+        """Return detections in order of receipt: stamp, sensor, fate, position, position of the track.
+
+        The fate is 0 for unused, 1 for used and 2 for late detections.
+        """
+        table = run.tables["detections"]
+        updates = run.tables["updates"]
+        where = placed(run)
+        rows = update_rows(run)
         sensors, sensor = np.unique(table["sensor"], return_inverse=True)
-        outcome = np.append(updates["disposition"].astype(np.str_), "")[
-            rows
-        ]  # row -1 is of none
+        # Row -1 selects the empty text at the end.
+        outcome = np.append(updates["disposition"].astype(np.str_), "")[rows]
         fate = np.isin(outcome, USED).astype(np.int64) + np.isin(outcome, LATE)
         order = np.argsort(table["receipt_ns"], kind="stable")
         order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
@@ -211,23 +210,26 @@ class _Recording:
         }
 
 
-_LINES = ("bound", "bound", "centre")  # of a road
+_LINES = ("bound", "bound", "centre")  # kinds of the three lines of a road
 
 
 def _place(position_m: FloatArray, prefix: str = "") -> Json:
-    """Columns of positions, shape (n, 2)."""
+    """Return the columns of positions (n, 2)."""
     return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
 
 
 def _thinned(
     tables: Sequence[Columns], time: str, most: int, label: str, notes: dict[str, None]
 ) -> list[Columns]:
-    """Return `tables` where they have more than `most` rows at every second time of the first one, every third ..."""
+    """Return `tables`, thinned to every second, third, ... time of the first one if they exceed `most` rows.
+
+    A note on the thinning is added to `notes`.
+    """
     num_rows = max(item.num_rows for item in tables)
     step = max(1, math.ceil(num_rows / most))
     if step > 1:
         notes[
-            f"{label}: the viewer shows one of {step} times, as there are {num_rows} rows"
+            f"{label}: the viewer shows every {step}th time, because there are {num_rows} rows"
         ] = None
     kept_ns = np.unique(tables[0][time])[::step]
     return [
@@ -237,7 +239,7 @@ def _thinned(
 
 
 def _column(values: npt.ArrayLike, digits: int = _DIGITS) -> list[float | int | None]:
-    """Numbers rounded to `digits`; None for what is not finite."""
+    """Return numbers rounded to `digits`; None for a value that is not finite."""
     given = np.asarray(values)
     rounded = given + 0 if given.dtype.kind != "f" else np.round(given, digits) + 0.0
     return [value if math.isfinite(value) else None for value in rounded.tolist()]

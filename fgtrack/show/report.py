@@ -1,4 +1,4 @@
-"""A report of runs: one HTML file with verdict, viewer, figures, tables and configuration, which loads nothing."""
+"""Report of runs: a self-contained HTML file with verdict, viewer, figures, tables and configuration."""
 
 import base64
 import json
@@ -19,12 +19,14 @@ from fgtrack.evaluation.runs import EvaluatedRun, recordings_warning
 from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.show.playback import Moment, playback
 
-#: Kinds of figures that are open; of some of them there are several, by object or run.
+#: Kinds of figures that are shown unfolded; a kind may have several figures, by object or run.
 _FIRST = ("close_up", "errors", "error_against_delay", "error_against_lag", "map")
 _CAPTIONS = {
-    "error_against_delay": "error against delay: a sweep over ten races that comes with fgtrack"
+    "error_against_delay": "error against delay: a sweep over ten races that is shipped with fgtrack"
 }
-_MOST_OPEN, _MOST_WARNINGS = 3, 3
+# Largest numbers of unfolded figures and warnings.
+_MOST_OPEN = 3
+_MOST_WARNINGS = 3
 _NONE = "–"
 
 
@@ -33,14 +35,15 @@ class ReportHead:
     """First part of a report."""
 
     sentences: Sequence[str] = ()
-    """Its verdict; empty for that of the comparison."""
+    """Verdict of the report; if empty, the verdict of the comparison."""
     assumptions: Sequence[str] = ()
     """Settings that the user has not given."""
     advice: Sequence[str] = ()
+    """Sentences of the advice."""
     moment: Moment | None = None
     """Time [ns], x and y [m] that the viewer shows first; None for an early late detection."""
     missing: Sequence[str] = ()
-    """Contents that the report leaves out, a line each."""
+    """A line for each content that the report lacks."""
 
 
 def write_report(
@@ -51,14 +54,15 @@ def write_report(
     head: ReportHead,
     overwrite: bool,
 ) -> int:
-    """Write the report of `runs` into the HTML file `out`, and return its size in bytes.
-    Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and `pictures` (PNG by
-    name, in the order in which they are shown) give the same bytes. Raises `CallError` if the file exists, and
-    `DataError` if a run or its map is damaged.
+    """Write the report of `runs` to the HTML file `out`, and return its size in bytes.
+
+    Verdict, warnings, viewer and three figures are unfolded, the rest is folded.
+    `pictures` are PNG images by name, in display order. Equal runs and pictures give
+    equal bytes. Raises `CallError` if the file exists, and `DataError` if a run or its
+    map is damaged.
     """
-    text = _page(runs, tables, pictures, head).encode(
-        "utf-8", "backslashreplace"
-    )  # names need not be UTF-8
+    # Names from files may not be valid UTF-8.
+    text = _page(runs, tables, pictures, head).encode("utf-8", "backslashreplace")
     with new_file(out, overwrite) as file:
         file.write(text)
     return len(text)
@@ -75,9 +79,8 @@ def _page(
     warnings += [
         f"{one.label}: {line}" for one in runs for line in diagnostics(one.run)
     ]
-    warnings += map(
-        str, noise_diagnostics(runs[0].run)
-    )  # of the sensors, as `replay` prints them
+    # The noise is the same for all runs, as in the output of `replay`.
+    warnings += map(str, noise_diagnostics(runs[0].run))
     warnings = list(dict.fromkeys((*warnings, *notes, *head.missing)))
     figures = {name: _figure(name, picture) for name, picture in pictures}
     first = [
@@ -86,11 +89,9 @@ def _page(
     first = list(dict.fromkeys(name for name in (*first, *figures) if name))[
         :_MOST_OPEN
     ]
-    few, more = (
-        _list(warnings[:_MOST_WARNINGS], "warnings"),
-        _list(warnings[_MOST_WARNINGS:]),
-    )
-    nothing = "<p>Nothing to evaluate: no errors and no innovations.</p>"
+    few = _list(warnings[:_MOST_WARNINGS], "warnings")
+    more = _list(warnings[_MOST_WARNINGS:])
+    nothing = "<p>Nothing to evaluate: no errors against truth and no innovations.</p>"
     shown = [table for table in tables.in_full().tables.values() if table.records]
     open_parts = {
         "Verdict": _list(head.sentences or tables.verdict) or nothing,
@@ -132,14 +133,14 @@ def _page(
         ),
         "script": _template("viewer.js"),
     }
-    # Each {{name}} is replaced once: inserted text is not searched.
+    # Each {{name}} is replaced once; inserted text is not searched again.
     return re.sub(
         r"\{\{(\w+)\}\}", lambda match: contents[match[1]], _template("page.html")
     )
 
 
 def _folded(title: str, content: str) -> str:
-    """Content behind a line that opens it; nothing without content."""
+    """Return content in a folded section; empty without content."""
     anchor = f"part-{title.lower().replace(' ', '-')}"
     return (
         f'<details id="{anchor}"><summary>{title}</summary>\n{content}</details>\n'
@@ -159,13 +160,13 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
 
 
 def _grid(title: str, records: Sequence[Mapping[str, str]]) -> str:
-    """A table of texts."""
+    """Return an HTML table of texts."""
     columns = [Column(name, [name], left=True) for name in records[0]]
     return _wide(title, Table(title, records, columns).to_html())
 
 
 def _wide(title: str, content: str) -> str:
-    """A table that scrolls sideways where the page is narrower."""
+    """Return an HTML table that scrolls sideways on a narrow page."""
     name = escape(printable(title))
     region = f'<div class="wide" tabindex="0" role="region" aria-label="{name}">'
     return f"<h3>{name}</h3>\n{region}<table>\n{content}</table></div>\n"
@@ -177,14 +178,15 @@ def _figures(texts: Iterable[str]) -> str:
 
 
 def _figure(name: str, picture: bytes) -> str:
-    text, data = escape(name), base64.b64encode(picture).decode()
+    text = escape(name)
+    data = base64.b64encode(picture).decode()
     image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
     caption = f"<figcaption>{_CAPTIONS.get(name, text.replace('_', ' '))}</figcaption>"
     return f'<figure class="figure" id="figure-{text}" tabindex="0">{image}{caption}</figure>\n'
 
 
 def _configuration(runs: Sequence[EvaluatedRun]) -> str:
-    """The keys whose values differ between runs, then everything of each run."""
+    """Return the keys with different values between runs, then the configuration of each run."""
     settings = pd.DataFrame(
         {
             one.label: pd.json_normalize(one.run.config).to_dict("records")[0]
@@ -207,7 +209,7 @@ def _configuration(runs: Sequence[EvaluatedRun]) -> str:
 
 
 def _facts(one: EvaluatedRun) -> dict[str, str]:
-    """Origin of a run."""
+    """Return the origin of a run as texts."""
     meta = one.run.meta
     wall_s = meta.get("wall_s")
     end = "" if meta.get("complete", True) else " (did not finish)"

@@ -1,4 +1,4 @@
-"""Writes what shows a run as a rosbag2 recording of standard messages, for RViz and whatever reads ROS."""
+"""Writer of rosbag2 recordings of standard messages that show a run, for RViz and other ROS tools."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -30,6 +30,7 @@ from fgtrack.inputs.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.show.shapes import Entity, Scene, Shape, ViewerMessage
 
 _FRAME_IDS = {"map": "map", "ego": "base_link"}
+# Numbers of Marker.msg.
 _KINDS = {
     "arrow": 0,
     "cube": 1,
@@ -37,17 +38,20 @@ _KINDS = {
     "cylinder": 3,
     "line": 4,
     "text": 9,
-}  # of Marker.msg
-_ADD, _DELETE = 0, 2
+}
+_ADD = 0
+_DELETE = 2
 _FOREVER = QosTime(0, 0)
 
 
 def write_ros2(
     path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False
 ) -> dict[str, int]:
-    """Write `messages`, in the order of their log times, as a rosbag2 recording; return their number by topic.
-    `path` becomes a rosbag2 folder, or its MCAP file alone where the name ends in `.mcap`. It appears when it is
-    complete. Outcomes have no standard message and are left out. Raises as `write_bag`.
+    """Write `messages`, in order of log times, as a rosbag2 recording; return their number by topic.
+
+    `path` becomes a rosbag2 folder, or a single MCAP file if the name ends in `.mcap`.
+    It appears when it is complete. Outcomes have no standard message and are not
+    written. Raises like `write_bag`.
     """
     with as_write_error(path):
         if path.suffix != ".mcap":
@@ -88,7 +92,10 @@ def _write(folder: Path, messages: Iterable[ViewerMessage]) -> dict[str, int]:
 
 
 class _MarkerFactory(MessageFactory):
-    """Makes markers and transforms as well; keeps the number of markers of each entity, to remove those left over."""
+    """Factory of markers and transforms.
+
+    It stores the number of markers of each entity, to remove surplus markers later.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,8 +118,10 @@ class _MarkerFactory(MessageFactory):
         }
 
     def messages(self, message: ViewerMessage) -> Iterator[tuple[str, RosMessage]]:
-        """Topics, and the messages on them that show `message`."""
-        content, topic, stamp_ns = message.content, message.topic, message.stamp_ns
+        """Yield each topic of `message` with the ROS message for it."""
+        content = message.content
+        topic = message.topic
+        stamp_ns = message.stamp_ns
         if isinstance(content, Scene):
             markers = [
                 item
@@ -149,17 +158,18 @@ class _MarkerFactory(MessageFactory):
             )
 
     def _markers(self, topic: str, stamp_ns: int, entity: Entity) -> list[RosMessage]:
-        """A namespace with a marker for each shape; markers that it had before beyond these are removed."""
+        """Return the markers of an entity: one namespace, with a marker for each shape.
+
+        Markers of a previous state with more shapes are removed.
+        """
         shapes = [*entity.shapes]
         before = self._shown.get((topic, entity.name), 0)
         self._shown[topic, entity.name] = len(shapes)
         shapes += [Shape("sphere", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))] * (
             before - len(shapes)
         )
-        header, lifetime_ns = (
-            self._header(stamp_ns, _FRAME_IDS[entity.frame]),
-            nanoseconds(entity.lifetime_s or 0.0),
-        )
+        header = self._header(stamp_ns, _FRAME_IDS[entity.frame])
+        lifetime_ns = nanoseconds(entity.lifetime_s or 0.0)
         sec, nanosec = divmod(lifetime_ns, NS_PER_S)
         lifetime = self._make(
             "builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec

@@ -1,4 +1,4 @@
-"""Messages that show a run: map, ego, truth, tracks and how sure they are, their corrected past, detections."""
+"""Messages that show a run: map, ego, truth, tracks with uncertainty, lagged states, detections."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -38,37 +38,37 @@ from fgtrack.show.states import (
 Messages = Iterator[ViewerMessage]
 _WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
 _OPACITY = {"tentative": 0.15, "coasting": 0.3}
-_CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
+_CONFIRMED = 0.5  # ellipses and arrows inside the box remain visible
 _SPEED_ARROW_S = 0.25
 _LETTER_M, _LABEL_ABOVE_M = 1.2, 1.5
 _MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
-_DEVIATIONS = 2.0  # of an ellipse
-_SHOWN_S = 0.5  # of a list that no later one of its sensor replaces
+_DEVIATIONS = 2.0  # half axes of an ellipse, in standard deviations
+_SHOWN_S = 0.5  # display time of a list, unless a later list of its sensor replaces it
 _DOT_M, _BEARING_M = 1.0, 150.0
 _USED = (*FUSED, Disposition.MERGED)
 
 
 @dataclass(frozen=True)
 class RunLayer:
-    """Prefix of the topics of a run, and the colour of its tracks."""
+    """Topic prefix of a run, and the colour of its tracks."""
 
     prefix: str = ""
     colour: str | None = None
-    """#RRGGBB; None for a colour of each track."""
+    """#RRGGBB; None for a different colour of each track."""
 
     def of_track(self, track_id: int, opacity: float = 1.0) -> Colour:
-        """Colour of a track."""
+        """Return the colour of a track."""
         return rgba(self.colour or PALETTE[track_id % len(PALETTE)], opacity)
 
 
 def rgba(text: str, opacity: float = 1.0) -> Colour:
-    """Return the colour #RRGGBB as shares of 1."""
+    """Return the colour #RRGGBB as numbers from 0 to 1."""
     r, g, b = (round(value / 255.0, 3) for value in bytes.fromhex(text[1:]))
     return r, g, b, opacity
 
 
 def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
-    """Bounds and reference line of each road, once."""
+    """Yield a single message with the bounds and the reference line of each road."""
     entities = list[Entity]()
     for name, road in maps.items():
         lines = zip(road_lines(road), (0.9, 0.9, 0.3), strict=True)
@@ -82,7 +82,7 @@ def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
 
 
 def ego_messages(ego: Columns, at_ns: int) -> Messages:
-    """The box of the ego in its own frame, once, and its state at every receipt."""
+    """Yield the box of the ego in its own frame, once, and its state at every receipt."""
     rows = np.flatnonzero(
         np.isfinite(np.stack([ego[name] for name in STATE_NAMES[:3]])).all(axis=0)
     )
@@ -93,7 +93,8 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
         yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), latched=True))
     states = np.nan_to_num(np.stack([ego[name] for name in STATE_NAMES], axis=-1))
     for row in rows[np.argsort(ego["receipt_ns"][rows], kind="stable")].tolist():
-        stamp_ns, receipt_ns = int(ego["stamp_ns"][row]), int(ego["receipt_ns"][row])
+        stamp_ns = int(ego["stamp_ns"][row])
+        receipt_ns = int(ego["receipt_ns"][row])
         yield ViewerMessage(
             receipt_ns,
             stamp_ns,
@@ -103,7 +104,7 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
 
 
 def truth_messages(truth: Columns) -> Iterator[Messages]:
-    """Boxes and poses of the true objects at every stamp; the ego is not among them."""
+    """Yield two streams: boxes and poses of the true objects at every stamp, without the ego."""
     table = located(truth.where(truth["object_id"] != EGO_ID))
     states = [
         Detection(x_m, y_m, _known(yaw_rad), object_id=object_id)
@@ -123,10 +124,10 @@ def truth_messages(truth: Columns) -> Iterator[Messages]:
 
 
 def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
-    """Streams of the messages that show a run alone, each in the order of log times."""
+    """Yield the streams of messages that show a single run, each in order of log times."""
     yield from _track_messages(run, layer)
     yield _past_messages(run, layer)
-    # Final states appear as soon as nothing can change them any more.
+    # A state is shown when it has become final.
     final = located(
         run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
     )
@@ -139,12 +140,10 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 
 def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
-    """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
+    """Yield, for every tick, boxes with names and speeds, 2-sigma ellipses of the positions, and poses."""
     tracks = located(run.tables["tracks"])
-    states, axes = (
-        _states(tracks, run.tables["objects"]),
-        ellipses(tracks, _DEVIATIONS).tolist(),
-    )
+    states = _states(tracks, run.tables["objects"])
+    axes = ellipses(tracks, _DEVIATIONS).tolist()
     facts = list(_rows(tracks, "track_id", "status", "speed_mps"))
     rows_at = dict.fromkeys(
         run.tables["timing"]["now_ns"].tolist(), np.zeros(0, dtype=np.int64)
@@ -187,11 +186,9 @@ def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
         return Entity(f"track {track_id}", tuple(shapes))
 
     def patch(row: int) -> Entity | None:
-        (long_m, short_m, yaw_rad), (at_m, _, (*_, above_m)), track_id = (
-            axes[row],
-            _pose(states[row]),
-            facts[row][0],
-        )
+        long_m, short_m, yaw_rad = axes[row]
+        at_m, _, (*_, above_m) = _pose(states[row])
+        track_id = facts[row][0]
         size_m = (2.0 * long_m, 2.0 * short_m, 0.02)
         shape = Shape(
             "cylinder",
@@ -211,7 +208,7 @@ def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 
 def _past_messages(run: Run, layer: RunLayer) -> Messages:
-    """At every tick the past of each track as known then: a line through its lagged states to the present one."""
+    """Yield, for every tick, the past of each track: a line through its lagged states up to the present state."""
     lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
     lagged = lagged.where(lagged["lag_s"] > 0.0)
     present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
@@ -224,10 +221,8 @@ def _past_messages(run: Run, layer: RunLayer) -> Messages:
     lines = [rows for rows in np.split(order, edges) if len(rows) > 1]
 
     def line(k: int) -> Entity:
-        track_id, points_m = (
-            int(ids[lines[k][0]]),
-            np.stack([x_m[lines[k]], y_m[lines[k]]], axis=-1),
-        )
+        track_id = int(ids[lines[k][0]])
+        points_m = np.stack([x_m[lines[k]], y_m[lines[k]]], axis=-1)
         return Entity(
             f"track {track_id}",
             (_line(points_m.tolist(), _TRACK_LINE_M, layer.of_track(track_id)),),
@@ -241,32 +236,35 @@ def _past_messages(run: Run, layer: RunLayer) -> Messages:
 
 
 def _detection_messages(run: Run, layer: RunLayer) -> Messages:
-    """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
-    An arrow leads from the position of a detection to where its track is at the tick that fused it. It is strong where
-    the detection came out of sequence, and faint where it did not.
+    """Yield, for each received list, its detections, arrows to their tracks, and their poses.
+
+    Unused detections are grey. An arrow leads from a detection to the position of its
+    track at the tick that fused it. The arrow is opaque for an out-of-sequence
+    detection, and faint otherwise.
     """
-    table, where, rows = run.tables["detections"], placed(run), update_rows(run)
-    fates = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")[
-        rows
-    ].tolist()  # row -1 is of none
+    table = run.tables["detections"]
+    where = placed(run)
+    rows = update_rows(run)
+    # Row -1 selects the empty text at the end.
+    dispositions = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")
+    fates = dispositions[rows].tolist()
     colours = {
         name: rgba(SENSORS[k % len(SENSORS)])
         for k, name in enumerate(np.unique(table["sensor"]).tolist())
     }
-    off_m = (
-        track_positions(run, rows) - where.position_m
-    )  # NaN without a position or a track
-    lengths_m, yaws_rad = (
-        np.hypot(*off_m.T).tolist(),
-        np.arctan2(off_m[:, 1], off_m[:, 0]).tolist(),
-    )
+    # NaN without a position or a track.
+    off_m = track_positions(run, rows) - where.position_m
+    lengths_m = np.hypot(*off_m.T).tolist()
+    yaws_rad = np.arctan2(off_m[:, 1], off_m[:, 0]).tolist()
     positions_m: list[Point] = list(map(tuple, where.position_m.tolist()))
     keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
     for key, group in groupby(
         sorted(range(len(keys)), key=keys.__getitem__), key=keys.__getitem__
     ):
-        (receipt_ns, sensor, stamp_ns), mine = key, list(group)
-        colour, late = colours[sensor], receipt_ns > stamp_ns
+        receipt_ns, sensor, stamp_ns = key
+        mine = list(group)
+        colour = colours[sensor]
+        late = receipt_ns > stamp_ns
         marks = [
             _mark(where, row, colour if fates[row] in _USED else _GREY) for row in mine
         ]
@@ -301,16 +299,17 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
 
 
 def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
-    """A ball where a detection was, or a line of sight where only its direction is known."""
+    """Return a sphere at the position of a detection, or a line of sight for a bearing alone.
+
+    None without an ego pose.
+    """
     x_m, y_m = where.position_m[row].tolist()
     if math.isfinite(x_m + y_m):
         return Shape(
             "sphere", colour, (_DOT_M, _DOT_M, _DOT_M), (x_m, y_m), _DOT_M / 2.0
         )
-    (from_x_m, from_y_m), bearing_rad = (
-        where.sensor_m[row].tolist(),
-        float(where.bearing_rad[row]),
-    )
+    from_x_m, from_y_m = where.sensor_m[row].tolist()
+    bearing_rad = float(where.bearing_rad[row])
     if not math.isfinite(from_x_m + from_y_m + bearing_rad):
         return None
     end_m = (
@@ -321,7 +320,7 @@ def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
 
 
 def _outcome_messages(run: Run, layer: RunLayer) -> Messages:
-    """Rows of `updates.csv` at their receipts."""
+    """Yield the rows of `updates.csv` at their receipts."""
     names = (
         "receipt_ns",
         "stamp_ns",
@@ -351,7 +350,10 @@ def _scenes(
     rows_at: Iterable[tuple[int, IntArray]],
     entity: Callable[[int], Entity | None],
 ) -> Messages:
-    """A scene of the entities of the rows at each time; those of the time before that are not in it are removed."""
+    """Yield a scene for each time, with the entities of its rows.
+
+    Entities of the time before that are missing now are removed.
+    """
     before: set[str] = set()
     for at_ns, rows in rows_at:
         entities = tuple(
@@ -368,7 +370,7 @@ def _scenes(
 def _objects(
     topic: str, log_ns: IntArray, stamps_ns: IntArray, states: Sequence[Detection]
 ) -> Messages:
-    """The states of every log time and stamp."""
+    """Yield a message with the states for each pair of log time and stamp."""
     times = list(zip(log_ns.tolist(), stamps_ns.tolist(), strict=True))
     for (log, stamp), rows in groupby(
         sorted(range(len(times)), key=times.__getitem__), key=times.__getitem__
@@ -377,7 +379,7 @@ def _objects(
 
 
 def _states(states: Columns, objects: Columns) -> list[Detection]:
-    """Pose of each row with its covariance, and class and size of its track, where known."""
+    """Return the pose of each row with its covariance, and the class and size of its track if known."""
     described = {
         track_id: Detection(
             length_m=_known(length_m),
@@ -427,7 +429,7 @@ def _known(value: float) -> float | None:
 
 
 def _pose(state: Detection) -> tuple[Point, float, tuple[float, float, float]]:
-    """Position, yaw, and length, width and height of an object; nominal where unknown."""
+    """Return position, yaw, and size (length, width, height) of an object; nominal values if unknown."""
     length_m, width_m, height_m = NOMINAL_SIZE_M
     size_m = (
         state.length_m or length_m,

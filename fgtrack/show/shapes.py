@@ -1,4 +1,4 @@
-"""Messages that show a run, for any file format: each has the time it is known at, and the time it is of."""
+"""Messages that show a run, independent of the file format. Each has a log time and a stamp."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ Colour = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A shape that stands or lies on the ground."""
+    """A shape on the ground."""
 
     kind: Literal["arrow", "cube", "cylinder", "line", "sphere", "text"]
     colour: Colour
     size_m: tuple[float, float, float]
-    """Length along the yaw, width, height; of a line its width, of a text the height of its letters."""
+    """Length along the yaw, width, height. A line has a width only, and a text a letter height."""
     at_m: Point = (0.0, 0.0)
-    """Its centre; of an arrow its tail."""
+    """Centre of the shape; of an arrow its tail."""
     height_m: float = 0.0
     """Height of the centre above the ground."""
     yaw_rad: float = 0.0
@@ -33,33 +33,33 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Entity:
-    """Shapes that belong together; a later entity of the same name on the same topic replaces them."""
+    """Shapes that belong together. A later entity with the same name and topic replaces them."""
 
     name: str
     shapes: tuple[Shape, ...]
     lifetime_s: float | None = None
-    """Time in seconds for which it is shown from its log time on; None until it is replaced or removed."""
+    """Display time [s] from the log time; None until it is replaced or removed."""
     frame: Literal["map", "ego"] = "map"
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Entities that appear or change, and names of those that are removed."""
+    """Entities that appear or change, and the names of removed entities."""
 
     entities: tuple[Entity, ...] = ()
     removed: tuple[str, ...] = ()
     latched: bool = False
-    """True if it is sent once, so that late subscribers must get it too."""
+    """True if the scene is sent once and must also reach late subscribers."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewerMessage:
-    """A message of a topic."""
+    """Message of a topic."""
 
     log_ns: int
-    """When its content is known: receipt or tick."""
+    """Time at which the content was available: receipt or tick."""
     stamp_ns: int
-    """When its content was measured, or is valid."""
+    """Time of the content: when it was measured, or is valid."""
     topic: str
     content: (
         Scene

@@ -82,14 +82,14 @@ def test_it_draws_the_past_towards_the_detection_and_is_fused_once(
 
 def test_what_is_not_there_is_said(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    with pytest.raises(fgtrack.DataError, match="there is no such list"):
+    with pytest.raises(fgtrack.DataError, match="the recording has no such list"):
         close_up_of(run, Arrival("lidar_cluster", 1, 2, 0))
     gated = np.flatnonzero(run.tables["updates"]["disposition"] == "birth")[0]
     values = (
         int(run.tables["updates"][name][gated])
         for name in ("stamp_ns", "receipt_ns", "index")
     )
-    with pytest.raises(fgtrack.DataError, match="no track has fused it"):
+    with pytest.raises(fgtrack.DataError, match="no track fused it"):
         close_up_of(run, Arrival(str(run.tables["updates"]["sensor"][gated]), *values))
     in_memory = fgtrack.replay(
         fgtrack.simulate("default", seed=3, duration_s=3.0),

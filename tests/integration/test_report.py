@@ -255,7 +255,7 @@ def test_long_runs_are_thinned_and_it_is_reported(
     np.testing.assert_allclose(numbers(shown["runs"][0]["ticks"]), ticks_s, atol=ATOL_S)
     assert set(shown["runs"][0]["tracks"]["t"]) <= set(shown["runs"][0]["ticks"])
     assert any(
-        note.startswith(f"{NAMES[0]}: the viewer shows one of {step} times")
+        note.startswith(f"{NAMES[0]}: the viewer shows every {step}th time")
         for note in notes
     )
 

@@ -71,7 +71,7 @@ def test_a_healthy_run_has_none(tmp_path: Path) -> None:
     [
         (Disposition.GATED, "the gate of `association`"),
         (Disposition.OUT_OF_BOUNDS, "--map"),
-        (Disposition.DUPLICATE, "repeats itself"),
+        (Disposition.DUPLICATE, "send lists twice"),
         (Disposition.SUPERSEDED, "clock.node_hz"),
         (Disposition.INVALID, "sensors.lidar.std"),
     ],
@@ -161,7 +161,7 @@ def test_noise_that_does_not_fit_is_told(
     assert str(found).startswith(
         f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}"
     )
-    assert f"errors were {times} times" in str(found)
+    assert f"errors are {times} times" in str(found)
     burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
     born = run_of(
         tmp_path / "born",

@@ -50,7 +50,7 @@ def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -
     [
         ({"width": "3.4 feet"}, "write 3.4in"),
         ({"width": "nan"}, "write 3.4in"),
-        ({"width": 0.1}, "not between 1.5 and 40 inches"),
+        ({"width": 0.1}, "must be between 1.5 and 40 inches"),
         ({"font": "No Such Font"}, "not installed"),
         ({"style": "nowhere.mplstyle"}, "cannot be used"),
     ],

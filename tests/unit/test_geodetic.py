@@ -273,7 +273,7 @@ def test_a_run_without_an_origin_has_no_map(tmp_path, capsys):
         == 2
     )
     assert (
-        "has no latitude and longitude; set `input.origin`" in capsys.readouterr().err
+        "the map has no latitude and longitude; set `input.origin`" in capsys.readouterr().err
     )
 
 

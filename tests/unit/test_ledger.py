@@ -219,7 +219,7 @@ def test_the_figure_names_every_part(karle: Ledger) -> None:
     assert labels == [
         "error now",
         *(part.cause for part in karle.waterfall[1:]),
-        "if nothing were late",
+        "without delays",
     ]
 
 

@@ -1,1 +1,1 @@
-"""Figures of runs and sweeps: `fgtrack.plot`. Drawn without pyplot: nothing is global."""
+"""Figures of runs and sweeps for `fgtrack.plot`. They do not use pyplot, so there is no global state."""

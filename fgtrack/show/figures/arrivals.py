@@ -1,4 +1,4 @@
-"""The figure of arrivals: stamps, receipts and outcomes of detections."""
+"""Figure of arrivals: stamps, receipts and dispositions of detections."""
 
 from collections.abc import Mapping
 from typing import Unpack
@@ -16,7 +16,7 @@ from fgtrack.runs.schema import Column
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import legend_above, usual_step_ns
 
-#: None is the colour of an estimator that is compared often.
+#: Colours of the outcomes. They differ from the colours of the common estimators.
 _COLOURS = {
     "fused in sequence": "#8A8F98",
     "fused out of sequence": "#B65CA8",
@@ -25,7 +25,7 @@ _COLOURS = {
     "merged": "#8C7A1F",
     "not used": "#000000",
 }
-#: What became of a detection, by disposition; every other one is `not used`.
+#: Outcome by disposition; with any other disposition a detection is `not used`.
 _FATES: Mapping[str, str] = {
     "merged": "merged",
     "in_sequence": "fused in sequence",
@@ -33,27 +33,26 @@ _FATES: Mapping[str, str] = {
     "beyond_window": "fused beyond the window",
     "birth": "started a track",
 }
-_SENSOR_IN, _DELAYS_IN = (
-    1.1,
-    1.2,
-)  # heights of a sensor: in the upper panel, and of its delays
-_SHOWN_LISTS = 20  # of the fastest sensor in the upper panel
+# Height of a sensor in the upper panel, and of the panel of its delays.
+_SENSOR_IN = 1.1
+_DELAYS_IN = 1.2
+# Number of lists of the fastest sensor in the upper panel.
+_SHOWN_LISTS = 20
 
 
 @styled
 def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """Above a part of the run, a line for each detection from stamp to receipt; below the delays, sensor by sensor.
+    """Detections as lines from stamp to receipt, and below them the delays of each sensor.
 
-    A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
-    detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours are the outcomes of the
+    A line that crosses another line was overtaken: its detection is out of sequence.
+    The upper panel shows the part with the most detections fused out of sequence. In
+    this part the fastest sensor sends twenty lists. Colours are the outcomes of the
     detections. Raises `DataError` if the run has no detections.
     """
     one = one_evaluated(run)
     updates = one.run.tables["updates"]
     if not updates.num_rows:
-        raise DataError(
-            f"{one.label}: has no detections, so there are no arrivals to draw"
-        )
+        raise DataError(f"{one.label}: no detections, so there are no arrivals to draw")
     sensors = np.unique(updates["sensor"]).tolist()
     heights = [_SENSOR_IN * len(sensors), *[_DELAYS_IN] * len(sensors)]
     sheet = Sheet(9.0, sum(heights) + 1.5, paper)
@@ -65,7 +64,8 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     _draw_flow(flow, updates, fates, first_ns)
     delay_ms = (updates["receipt_ns"] - updates["stamp_ns"]) / (NS_PER_S / 1e3)
     received_s = (updates["receipt_ns"] - first_ns) / NS_PER_S
-    low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+    low_ms = min(0.0, float(delay_ms.min()))
+    high_ms = max(1.0, float(delay_ms.max()))
     for name, color in _COLOURS.items():
         if count := int((fates == name).sum()):
             flow.plot(
@@ -92,7 +92,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
 
 def _draw_flow(axes: Axes, updates: Columns, fates: Column, first_ns: int) -> None:
-    """A line for each detection of the busiest part, a pair of levels for each sensor."""
+    """Draw a line for each detection of the busiest part, with two levels for each sensor."""
     own = (
         updates["stamp_ns"][updates["sensor"] == name]
         for name in np.unique(updates["sensor"]).tolist()
@@ -108,9 +108,8 @@ def _draw_flow(axes: Axes, updates: Columns, fates: Column, first_ns: int) -> No
     counts = np.searchsorted(
         receipts_ns, receipts_ns + length_ns, side="right"
     ) - np.arange(len(receipts_ns))
-    start_ns = int(
-        receipts_ns[counts.argmax()]
-    )  # where the most of the late ones were received
+    # The part with the most receipts of late detections.
+    start_ns = int(receipts_ns[counts.argmax()])
     inside = (updates["receipt_ns"] >= start_ns) & (
         updates["stamp_ns"] <= start_ns + length_ns
     )
@@ -118,12 +117,10 @@ def _draw_flow(axes: Axes, updates: Columns, fates: Column, first_ns: int) -> No
     for name, color in _COLOURS.items():
         for level, sensor in enumerate(sensors):
             mine = inside & (fates == name) & (updates["sensor"] == sensor)
-            sensed_s, received_s = (
-                (updates[key][mine] - first_ns) / NS_PER_S
-                for key in ("stamp_ns", "receipt_ns")
-            )
-            tops = np.stack([sensed_s, np.full(len(sensed_s), level + 0.9)], axis=-1)
-            ends = np.stack([received_s, np.full(len(sensed_s), level + 0.1)], axis=-1)
+            stamps_s = (updates["stamp_ns"][mine] - first_ns) / NS_PER_S
+            received_s = (updates["receipt_ns"][mine] - first_ns) / NS_PER_S
+            tops = np.stack([stamps_s, np.full(len(stamps_s), level + 0.9)], axis=-1)
+            ends = np.stack([received_s, np.full(len(stamps_s), level + 0.1)], axis=-1)
             axes.add_collection(
                 LineCollection(
                     list(np.stack([tops, ends], axis=1)),
@@ -132,7 +129,7 @@ def _draw_flow(axes: Axes, updates: Columns, fates: Column, first_ns: int) -> No
                     zorder=3,
                 )
             )
-            axes.plot(sensed_s, tops[:, 1], "o", ms=3.5, color=color, zorder=4)
+            axes.plot(stamps_s, tops[:, 1], "o", ms=3.5, color=color, zorder=4)
             axes.plot(received_s, ends[:, 1], "v", ms=4.5, color=color, zorder=4)
     axes.set_yticks([level + at for level in range(len(sensors)) for at in (0.1, 0.9)])
     axes.set_yticklabels(

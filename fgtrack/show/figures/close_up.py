@@ -1,4 +1,4 @@
-"""The figure of one late detection: where it comes in, and its effect on the errors of past and present."""
+"""Figure of one late detection: its effect on the errors of past and present estimates."""
 
 import textwrap
 from collections.abc import Sequence
@@ -21,7 +21,11 @@ from fgtrack.show.figures.style import GREY, legend_above, run_styles
 from fgtrack.show.palette import CurveStyle
 
 STEP_S = 0.01
-"""Between estimates; that of the grid of the backward-forward EKF, whose states are constant in between."""
+"""Time between estimates.
+
+It equals the grid step of the backward-forward EKF, whose states are constant within a
+step.
+"""
 
 _FORGET = ("ekf-backward-forward", "rewind-forget", "backward-forward")
 _RINGS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -30,7 +34,7 @@ _MS = NS_PER_S / 1e3
 
 @dataclass(frozen=True)
 class Arrival:
-    """A detection, by its list and its index there."""
+    """A detection, identified by its list and its index in the list."""
 
     sensor: str
     stamp_ns: int
@@ -43,44 +47,51 @@ class Estimates:
     """Estimates of one track at several stamps."""
 
     stamps_ns: IntArray
-    """Rising, shape (m,); the last one is the present."""
+    """Ascending stamps, shape (m,); the last one is the present."""
     means: FloatArray
     """x, y, yaw, speed, yaw rate[, acceleration], shape (m, n)."""
 
 
 @dataclass(frozen=True)
 class CloseUp:
-    """A late detection, and a track before and after it was fused."""
+    """A late detection, and the estimates of its track before and after the fusion."""
 
     arrival: Arrival
     now_ns: int
-    """Time of the tick at which it came in."""
+    """Time of the tick that fused the detection."""
     track_id: int
     before: Estimates
     after: Estimates
     fused_ns: IntArray
-    """Rising stamps of the other measurements in the track from 0.15 s before the detection on, shape (k,)."""
+    """Stamps of the track's other measurements, from 0.15 s before the detection, ascending, shape (k,)."""
     rule: str = ""
-    """Rule by which the detection was chosen, a sentence."""
+    """Sentence on the choice of the detection."""
 
 
 @styled
 def close_up(
     runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]
 ) -> Figure:
-    """A late detection and its effect on the estimates of each run.
+    """A late detection, and its effect on the estimates of each run.
 
-    Above, for each run, the present relative to the true position, in the direction of travel to the right: nearer to
-    the centre is better. Below the error of the estimates at the stamps up to now, before the detection arrived (grey)
-    and after it. In a column of a paper all errors are in one plot. Without truth the estimate of the first run
-    afterwards takes its role. `close_ups` are those of each run, of the same detection: `fgtrack.close_ups`. Raises
-    `CallError` if they are not as many, or of different detections.
+    The upper plots show the present position relative to the true position, for each
+    run. The direction of travel points to the right. Nearer to the centre is better.
+    The lower plots show the error of the estimates over their stamps, before the
+    detection arrived (grey) and after. A narrow figure has a single plot with all
+    errors.
+
+    Without truth the final estimate of the first run is the reference. `close_ups` has
+    an entry for each run, of the same detection: `fgtrack.close_ups`. Raises
+    `CallError` if their number differs, or they belong to different detections.
     """
     every = evaluated(runs)
     if len(every) != len(close_ups) or len({item.arrival for item in close_ups}) != 1:
-        raise CallError(f"{len(every)} runs need as many close-ups of one detection")
+        raise CallError(
+            f"{len(every)} runs need {len(every)} close-ups of one detection, use fgtrack.close_ups"
+        )
     first = close_ups[0]
-    now_ns, at_m = np.array([first.now_ns]), first.after.means[-1, :2]
+    now_ns = np.array([first.now_ns])
+    at_m = first.after.means[-1, :2]
     paths = [
         path
         for path in true_paths(every[0].run.tables["truth"])
@@ -103,13 +114,11 @@ def close_up(
     highest_m = max(
         float(np.hypot(*off_m.T).max()) for pair in both for _, off_m in pair
     )
-    styles, late_ms = (
-        run_styles(every).values(),
-        (first.now_ns - first.arrival.stamp_ns) / _MS,
-    )
-    stamp, quantity = "stamp relative to now [ms]", "position error [m]"
+    styles = run_styles(every).values()
+    late_ms = (first.now_ns - first.arrival.stamp_ns) / _MS
+    stamp = "stamp relative to now [ms]"
     quantity = (
-        quantity
+        "position error [m]"
         if truth is not None
         else f"distance to {every[0].label}\nafterwards [m]"
     )
@@ -171,7 +180,7 @@ def close_up(
 def _offsets(
     one: CloseUp, each: Estimates, first: CloseUp, truth: TruePath | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Stamps of the grid in ms from now, (m,), and how far ahead and to the left of the reference it is, (m, 2)."""
+    """Return the grid stamps in ms from now (m,), and the offset ahead and to the left of the reference (m, 2)."""
     each_ns, known_ns = (
         stamps_ns - one.now_ns for stamps_ns in (each.stamps_ns, first.after.stamps_ns)
     )
@@ -191,7 +200,7 @@ def _offsets(
 def _draw_present(
     axes: Axes, style: CurveStyle, ends_m: Sequence[Any], reach_m: float, centre: str
 ) -> None:
-    """The present before and after, seen from the reference."""
+    """Draw the present position before and after the fusion, relative to the reference."""
     ring_m = max(
         [each for each in _RINGS_M if each < 0.8 * reach_m], default=0.5 * reach_m
     )
@@ -246,7 +255,7 @@ def _draw_errors(
     pair: Sequence[tuple[FloatArray, FloatArray]],
     forgets: bool,
 ) -> None:
-    """Errors at the stamps up to now; at the bottom the measurements since that of the detection."""
+    """Draw the errors over the stamps up to now, and at the bottom the measurements since the detection."""
     before, (at_ms, error_m) = (
         (times_ms, np.hypot(*off_m.T)) for times_ms, off_m in pair
     )

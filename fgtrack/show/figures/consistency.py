@@ -1,4 +1,4 @@
-"""The figure of NEES and NIS over time, with their chi-square bands."""
+"""Figure of NEES and NIS over time, with their chi-square bands."""
 
 from typing import Unpack
 
@@ -23,24 +23,29 @@ from fgtrack.show.figures.style import (
 )
 from fgtrack.show.palette import SENSORS
 
-_WINDOWS = 40  # of a run, so many values does each mean of NIS hold
-_SHORTEST, _LONGEST = 5, 100
-_LOWEST = 0.02  # of the axis, as a share of the expected value
+# Number of moving means in a run, and the least and largest number of NIS values in each.
+_WINDOWS = 40
+_SHORTEST = 5
+_LONGEST = 100
+# Lower end of the axis, as a share of the expected value.
+_LOWEST = 0.02
 
 
 @styled
 def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """NEES of the position, averaged over the objects of a tick, and NIS by sensor, each in its 95 % band.
+    """Position NEES, averaged over the objects of a tick, and NIS by sensor, each with its 95 % band.
 
-    A consistent estimator is inside of the band at 95 % of the ticks, and around the expected value; above it the
-    covariance is too small, below it too large. A dot is the NIS of a detection, the line the mean of several in a row
-    and the band that of this mean. Raises `DataError` if the run has neither truth of its tracks nor innovations.
+    A consistent estimator is inside the band at 95 % of the ticks, around the expected
+    value. Above the band the covariance is too small, below it too large. A dot is the
+    NIS of a detection. The line is the mean of several successive values, with the band
+    of this mean. Raises `DataError` if the run has neither errors against truth nor
+    innovations.
     """
     one = one_evaluated(run)
     panels = _panels(one)
     if not panels:
         raise DataError(
-            f"{one.label}: has no errors and no innovations, so there is no consistency to draw"
+            f"{one.label}: no errors against truth and no innovations, so there is no consistency to draw"
         )
     sheet = Sheet(10.0, 1.0 + 2.1 * len(panels), paper)
     rows = sheet.plots(len(panels), sharex=True)[:, 0]
@@ -58,10 +63,8 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
                 np.bincount(index, each) / count for each in (values, dof)
             )
             band = chi_square_band(expected * count, count)
-            colour, inside = (
-                run_styles([one])[one.label].colour,
-                (mean >= band[0]) & (mean <= band[1]),
-            )
+            colour = run_styles([one])[one.label].colour
+            inside = (mean >= band[0]) & (mean <= band[1])
             subject, unit, line = "position", "ticks", ""
         else:
             sensor = name.removeprefix("NIS of ")
@@ -74,18 +77,14 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
                 max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values)
             )
             subject, unit, line = sensor, "detections", f"; line: mean of {length}"
-            order, share = (
-                np.argsort(since_ns, kind="stable"),
-                np.full(length, 1.0 / length),
-            )
+            order = np.argsort(since_ns, kind="stable")
+            share = np.full(length, 1.0 / length)
             at_ns, mean, expected = (
                 np.convolve(each[order], share, "valid")
                 for each in (since_ns, values, dof)
             )
-            at_ns, band = (
-                at_ns.astype(np.int64),
-                chi_square_band(expected * length, np.full(len(mean), length)),
-            )
+            at_ns = at_ns.astype(np.int64)
+            band = chi_square_band(expected * length, np.full(len(mean), length))
             axes.plot(
                 since_ns / NS_PER_S,
                 values,
@@ -96,7 +95,8 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
                 alpha=0.5,
                 rasterized=True,
             )
-        step_ns, time_s = usual_step_ns(at_ns), at_ns / NS_PER_S
+        step_ns = usual_step_ns(at_ns)
+        time_s = at_ns / NS_PER_S
         x_s, y = broken_line(at_ns, time_s, mean, step_ns)
         low, high, middle = (
             broken_line(at_ns, time_s, each, step_ns)[1] for each in (*band, expected)
@@ -106,10 +106,9 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         label = f"{subject}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share_inside}{line}"
         axes.plot(x_s, y, color=colour, lw=1.1, label=label)
         axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
-        positive, shown = (
-            values[values > 0.0],
-            np.concatenate([mean[mean > 0.0], *band]),
-        )  # the axis is logarithmic
+        # The axis is logarithmic, so only positive values count.
+        positive = values[values > 0.0]
+        shown = np.concatenate([mean[mean > 0.0], *band])
         limits = [
             max(_LOWEST * float(np.median(expected)), 0.8 * float(shown.min())),
             1.25 * float(shown.max()),
@@ -129,25 +128,22 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         legend_above(axes)
     rows[-1].set_xlabel("time [s]")
     sheet.title(
-        f"{one.label}: consistency: normalised squares of errors and innovations, with their 95 % bands"
+        f"{one.label}: consistency of errors (NEES) and innovations (NIS), with 95 % bands"
     )
     return sheet.figure
 
 
 _NEES = "NEES of the position"
-_Squares = tuple[
-    IntArray, FloatArray, IntArray
-]  # stamps, values, degrees of freedom; of shape (n,) each
+#: Stamps, normalised squares and degrees of freedom, shape (n,) each.
+_Squares = tuple[IntArray, FloatArray, IntArray]
 
 
 def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
-    """Stamps, normalised squares and degrees of freedom to show, by name of the panel."""
+    """Return stamps, normalised squares and degrees of freedom by name of the panel."""
     result: dict[str, _Squares] = {}
     if one.matching is not None:
-        values, stamps_ns = (
-            position_nees(one.matching),
-            one.matching.tracks["stamp_ns"][one.matching.paired],
-        )
+        values = position_nees(one.matching)
+        stamps_ns = one.matching.tracks["stamp_ns"][one.matching.paired]
         known = np.isfinite(values)
         if known.any():
             result[_NEES] = stamps_ns[known], values[known], np.full(known.sum(), 2)
@@ -167,5 +163,5 @@ def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
 
 
 def has_squares(one: EvaluatedRun) -> bool:
-    """True if `consistency` has anything to show."""
+    """True if `consistency` can be drawn."""
     return bool(_panels(one))

@@ -30,25 +30,27 @@ from fgtrack.show.figures.style import (
 )
 from fgtrack.show.palette import CurveStyle
 
-#: What is drawn, with its name, its unit, and that unit over the one of the values.
+#: Name, unit, and factor to this unit of each quantity.
 _QUANTITIES = {
     "position_m": ("position", "m", 1.0),
     "speed_mps": ("speed", "m/s", 1.0),
     "yaw_rad": ("yaw", "deg", 180.0 / math.pi),
 }
-_WINDOWS = 60  # moving means in the time that is shown
-_SHORTEST_S = 0.2  # of these
+# Number of windows of the moving mean in the displayed time, and the shortest window.
+_WINDOWS = 60
+_SHORTEST_S = 0.2
 
 
 @styled
 def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> Figure:
-    """Moving RMS error in position, speed and yaw over time, a line for each run; in the legend the RMSE of all.
+    """Moving RMS error in position, speed and yaw over time, a line for each run; the legend gives the total RMSE.
 
-    The present states are solid or dashed, the final states of a smoother dotted. Each point is the root mean square
-    over a sixtieth of the time shown. Lines are broken where nothing was tracked; quantities that the truth does not
-    hold are left out. Without `object_id` the figure is of the only object, or all together.
+    Present states are solid or dashed lines, final states of a smoother are dotted.
+    Each point is the root mean square over a sixtieth of the displayed time. Lines are
+    interrupted where nothing was tracked. Quantities without truth are not drawn.
+    Without `object_id` the figure shows the only object, or all objects together.
 
-    Raises `DataError` if no run has truth, or none of this object.
+    Raises `DataError` if no run has truth, or none has truth of this object.
     """
     read = evaluated(runs)
     every = {item: item.matching for item in read if item.matching is not None}
@@ -57,7 +59,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
         raise DataError("no run has truth, so there are no errors to draw")
     if object_id is not None and object_id not in known:
         raise DataError(
-            f"object {object_id}: no run has truth of it, there are {', '.join(map(str, known))}"
+            f"object {object_id}: no run has truth of this object, use {', '.join(map(str, known))}"
         )
     wanted = known[0] if len(known) == 1 else object_id
     curves = _curves(every, wanted)
@@ -79,7 +81,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     sheet = Sheet(9.0, 1.5 + 2.0 * len(names), paper)
     rows = sheet.plots(len(names), sharex=True)[:, 0]
     for axes, name in zip(rows, names, strict=True):
-        what, unit, factor = _QUANTITIES[name]
+        quantity, unit, factor = _QUANTITIES[name]
         for label, style, step_ns, times_ns, values in curves:
             moments = Moments.of(factor * values[name])
             text = (
@@ -94,11 +96,10 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
                 ls=style.line,
                 lw=1.4,
                 label=f"{label}: {text}" if axes is rows[0] else text,
-                zorder=2.0
-                if style.line == "-"
-                else 2.5,  # a dashed line shows what it lies on
+                # A dashed line is drawn above, so that the line below it is visible.
+                zorder=2.0 if style.line == "-" else 2.5,
             )
-        axes.set(ylabel=f"{what} error [{unit}]", ylim=(0.0, None))
+        axes.set(ylabel=f"{quantity} error [{unit}]", ylim=(0.0, None))
         legend_above(axes)
     rows[-1].set_xlabel("time [s]")
     whose = "all objects" if wanted is None else f"object {wanted}"
@@ -107,13 +108,13 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
 
 
 _Curve = tuple[str, CurveStyle, float, IntArray, Mapping[str, FloatArray]]
-"""Label, style, usual step in ns, rising times in ns since the start of the recording, and errors."""
+"""Label, style, usual step in ns, ascending times in ns since the start of the recording, and errors."""
 
 
 def _curves(
     runs: Mapping[EvaluatedRun, Matching], object_id: int | None
 ) -> list[_Curve]:
-    """Errors of the present states of every run, then of the final ones of those that have them."""
+    """Return the errors of the present states of every run, then those of final states."""
     styles = run_styles(list(runs))
     first_ns = {
         item: start_ns(group) for group in by_recording(list(runs)) for item in group
@@ -136,10 +137,8 @@ def _curves(
         style = styles[item.label]._replace(line=":") if more else styles[item.label]
         if len(rows) or not more:
             values = {name: each[rows] for name, each in result.values.items()}
-            times_ns, step_ns = (
-                result.stamps_ns[rows] - first_ns[item],
-                usual_step_ns(its.tracks["now_ns"]),
-            )
+            times_ns = result.stamps_ns[rows] - first_ns[item]
+            step_ns = usual_step_ns(its.tracks["now_ns"])
             curves.append((item.label + more, style, step_ns, times_ns, values))
     return curves
 
@@ -147,26 +146,25 @@ def _curves(
 def moving_rms(
     stamps_ns: IntArray, values: FloatArray, window_ns: int
 ) -> tuple[IntArray, FloatArray]:
-    """Distinct stamps with a value, and the root mean square of the values within half a window around each."""
+    """Return the distinct stamps with a value, and the root mean square within half a window around each."""
     known = np.isfinite(values)
-    stamps_ns, below = (
-        stamps_ns[known],
-        np.concatenate([[0.0], np.cumsum(np.square(values[known]))]),
-    )
+    stamps_ns = stamps_ns[known]
+    sums = np.concatenate([[0.0], np.cumsum(np.square(values[known]))])
     distinct_ns = np.unique(stamps_ns)
     first = np.searchsorted(stamps_ns, distinct_ns - window_ns // 2, side="left")
     last = np.searchsorted(stamps_ns, distinct_ns + window_ns // 2, side="right")
     return distinct_ns, np.sqrt(
-        np.maximum(below[last] - below[first], 0.0) / (last - first)
+        np.maximum(sums[last] - sums[first], 0.0) / (last - first)
     )
 
 
 @styled
 def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
-    """Position RMSE against the lag, a line for each run; level where a run has no lagged states.
+    """Position RMSE against the lag, a line for each run; a horizontal line for a run without lagged states.
 
-    Of a track that ended there are no lagged states of its last moments, so the thin dotted line shows the present
-    states of the same tracks at the same stamps: the distance between the two is the gain of waiting. Raises
+    The thin dotted line shows the present states of the same tracks at the same stamps.
+    The distance between the two lines is the benefit of waiting. This comparison is
+    needed because a track that ended has no lagged states for its last moments. Raises
     `DataError` if no run has tracks with truth.
     """
     every = evaluated(runs)
@@ -203,5 +201,5 @@ def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
         ylim=(0.0, 1.08 * axes.dataLim.y1 or 1.0),
     )
     legend_above(axes)
-    sheet.title("Error against lag: what it gains to wait")
+    sheet.title("Error against lag: the benefit of waiting")
     return sheet.figure

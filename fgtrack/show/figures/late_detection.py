@@ -1,4 +1,4 @@
-"""Close-ups of runs: which late detection to look at, and its track just before and just after it was fused."""
+"""Choice of a late detection, and the estimates of its track just before and after the fusion."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,23 +24,31 @@ from fgtrack.show.figures.close_up import close_up as figure_of
 from fgtrack.show.figures.paper import Paper
 from fgtrack.tracking.tracker import Tracker
 
-_BACK_S = 0.15  # before the detection the estimates begin
-_MOST_STEPS = 500  # estimates of each track, however late the detection
+# The estimates begin this time before the detection.
+_BACK_S = 0.15
+# Largest number of estimates of a track, for a detection with a long delay.
+_MOST_STEPS = 500
 _STATE = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"]
 _DETECTION = ["sensor", "stamp_ns", "receipt_ns", "index"]
-_SETTLED = 20  # measurements of a track before which it moves for want of a good start
-_EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed up to the detection for every run
+# Number of measurements after which the first state of a track hardly matters.
+_SETTLED = 20
+# Length of the first part of the recording in which the detection is chosen, if possible. Every run replays
+# the recording up to the detection.
+_EARLY_S = 20.0
 
 
 def close_ups(
     runs: Sequence[Run | Path | str], stamp_ns: int | None = None
 ) -> list[CloseUp]:
-    """Return one late detection in slow motion, in each of `runs`: its track before and after it was fused.
+    """Return close-ups of one late detection in each of `runs`: its track before and after the fusion.
 
-    The detection is a typical one of those that lower the error of the first run's present, see `chosen`, or that with
-    the stamp nearest to `stamp_ns`. `runs` are of one recording, or their folders; it is replayed up to there for every
-    run. `fgtrack.plot.close_up` draws the result. Raises `CallError` if a folder holds no run, and `DataError` if the
-    first run fused no such detection, a run did not fuse it, or a recording is not there any more.
+    The detection is a typical one among those that lower the present error of the first
+    run, see `chosen`. With `stamp_ns` it is the one with the nearest stamp. `runs` are
+    runs of one recording, or their folders. The recording is replayed up to the
+    detection for every run. `fgtrack.plot.close_up` draws the result.
+
+    Raises `CallError` if a folder is not a run. Raises `DataError` if the first run
+    fused no such detection, another run did not fuse it, or a recording is missing.
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
     arrival, rule = chosen(read, stamp_ns)
@@ -50,9 +58,9 @@ def close_ups(
 def drawn_close_up(
     runs: Sequence[EvaluatedRun], stamp_ns: int | None = None, **paper: Unpack[Paper]
 ) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
-    """Return the named figure of `close_ups` and the first of these; no figure and the error where there is none.
+    """Return the named figure of `close_ups` and its first close-up; no figure and the error if there is none.
 
-    It is that of the runs of the first one's recording.
+    It covers the runs of the same recording as the first run.
     """
     same = by_recording(runs)[0]
     try:
@@ -63,28 +71,27 @@ def drawn_close_up(
 
 
 def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
-    """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+    """Return the track of `run` that fused `arrival`, before and after the fusion.
 
-    What came with the same tick before the list is processed first, by itself; what came after it is left out. Raises
-    `DataError` if the recording or a file that the configuration names is not there any more, the recording does not
-    hold the detection, or no track fused it.
+    The recording is replayed up to the detection. Messages of the same tick before the
+    list are processed first, in a tick of their own. Messages after the list are
+    ignored. Raises `DataError` if the recording or a configured file is missing, the
+    recording lacks the detection, or no track fused it.
     """
     if run.recording is None:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(
-            f"{given}: the recording of the run is not there, so no close-up"
+            f"{given}: the recording of the run is missing, so there is no close-up"
         )
     try:
         config = validate(Config, run.config, str(run.config_path))
         tracker = build_tracker(config)
         messages = open_input(run.recording, config.input).messages()
-    except CallError as error:  # nobody has called with it: the run names it
-        raise DataError(f"{error}, so no close-up") from error
+    except CallError as error:  # the path comes from the run, not from the caller
+        raise DataError(f"{error}, so there is no close-up") from error
     key = arrival.sensor, arrival.receipt_ns, arrival.index
-    start_ns, fused_ns = (
-        arrival.stamp_ns - nanoseconds(_BACK_S),
-        list[tuple[int | None, int]](),
-    )
+    start_ns = arrival.stamp_ns - nanoseconds(_BACK_S)
+    fused_ns = list[tuple[int | None, int]]()
     name = f"detection {arrival.index} of {arrival.sensor} received at {arrival.receipt_ns} ns"
     for now_ns, batch in delivered(messages, config):
         lists = (
@@ -130,9 +137,10 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
             or taken.track_id not in before
         ):
             raise DataError(
-                f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})"
+                f"{name}: no track fused it ({taken.disposition if taken else 'no such detection'})"
             )
-        track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
+        track_id = taken.track_id
+        after = _estimates(tracker, track_id, stamps_ns)
         since_ns = sorted(
             stamp
             for track, stamp in fused_ns
@@ -147,11 +155,11 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
             np.array(since_ns, dtype=np.int64),
             rule,
         )
-    raise DataError(f"{name}: there is no such list")
+    raise DataError(f"{name}: the recording has no such list")
 
 
 def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
-    """States at the falling `stamps_ns`, as far as the track's window reaches back."""
+    """Return the states at the descending `stamps_ns`, as far as the track's window reaches back."""
     states = []
     for stamp_ns in stamps_ns:
         try:
@@ -166,13 +174,17 @@ def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Est
 
 
 def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, str]:
-    """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
+    """Return a typical out-of-sequence detection that every run fused, and a sentence on the choice.
 
-    Of those that lower the error of the first run's present, it is the one with errors nearest to their root mean
-    squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. It is one of
-    the first 20 s where there is any. Without truth it is the one that moves the present by the median. Ticks at which
-    a track fused several detections, and tracks with fewer than twenty, are left out. With `stamp_ns` it is the one
-    with the nearest stamp. Raises `DataError` if there is none.
+    Candidates lower the present error of the first run. Their errors are the error
+    before the fusion in the first run, and the errors after it in all runs. The chosen
+    detection has the errors nearest to their root mean squares; the largest ratio of
+    the errors counts. It lies in the first 20 s if possible. Without truth, it is the
+    detection that moves the present by the median distance. With `stamp_ns` it is the
+    one with the nearest stamp.
+
+    Ticks in which a track fused several detections are excluded, and tracks with fewer
+    than twenty measurements. Raises `DataError` if there is no candidate.
     """
     first, *others = (_late_detections(run) for run in runs)
     late = first[
@@ -180,8 +192,8 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
     ]
     if late.empty:
         raise DataError(
-            f"{runs[0].path or 'the run'}: no late detection was fused by itself after {_SETTLED} others, so there is "
-            "no close-up"
+            f"{runs[0].path or 'the run'}: no late detection was fused alone in a tick after {_SETTLED} other "
+            "measurements of its track, so there is no close-up"
         )
     arrivals = [Arrival(*key) for key in late.index.tolist()]
     if stamp_ns is not None:
@@ -207,21 +219,23 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
         for rows_m in (errors_m[lowered], errors_m)
     )
     with np.errstate(divide="ignore"):
-        apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
-    candidates = lowered & np.isfinite(apart)
+        ratio = np.abs(np.log(errors_m / rms_m)).max(axis=1)
+    candidates = lowered & np.isfinite(ratio)
     receipts_ns = np.array([item.receipt_ns for item in arrivals])
     early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
-    row = int(np.where(early if early.any() else candidates, apart, np.inf).argmin())
+    row = int(np.where(early if early.any() else candidates, ratio, np.inf).argmin())
     return arrivals[row], (
-        f"{100.0 * float(lowered.mean()):.0f} % of {len(late)} late detections lower the error of the present; this "
-        f"one, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; "
-        f"of all {rms_before_m:.2f} to {rms_after_m:.2f} m)."
+        f"{100.0 * float(lowered.mean()):.0f} % of {len(late)} late detections lower the present error; this "
+        f"detection, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to "
+        f"{rms_m[1]:.2f} m; over all late detections {rms_before_m:.2f} to {rms_after_m:.2f} m)."
     )
 
 
 def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
-    """Late detections that a settled track fused by themselves, by `_DETECTION`.
-    Columns are the shift of the present from its prediction and its error before and after, NaN without truth, in m.
+    """Return the late detections that a settled track fused alone in a tick, indexed by `_DETECTION`.
+
+    Columns [m] are the shift of the present from its prediction, and its errors before
+    and after; NaN without truth.
     """
     both = ["tick", "track_id"]
     fused = run.updates[run.updates["disposition"].isin(FUSED[1:])]
@@ -237,7 +251,8 @@ def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have n
         tracks.assign(tick=tracks["tick"] + 1), on=both, suffixes=("", "_before")
     )
     late = late.drop_duplicates(_DETECTION)
-    now_ns, at_m = late["now_ns"].to_numpy(), late[["x_m", "y_m"]].to_numpy()
+    now_ns = late["now_ns"].to_numpy()
+    at_m = late[["x_m", "y_m"]].to_numpy()
     dt_s = (now_ns - late["now_ns_before"].to_numpy()) / NS_PER_S
     predicted_m = CTRV().predict(
         late[[f"{name}_before" for name in _STATE]].to_numpy(), dt_s
@@ -246,9 +261,9 @@ def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have n
     true_m = np.stack(
         [path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)]
     )
-    apart_m = np.linalg.norm(true_m - at_m, axis=-1)
+    distance_m = np.linalg.norm(true_m - at_m, axis=-1)
     nearest_m = true_m[
-        np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=0),
+        np.where(np.isnan(distance_m), np.inf, distance_m).argmin(axis=0),
         np.arange(len(late)),
     ]
     for name, item, other in (

@@ -1,4 +1,4 @@
-"""The figure of the ledger: the error of the present, and what is left without each of its causes."""
+"""Figure of the ledger: the present error, and its rest without each of its causes."""
 
 import itertools
 import math
@@ -18,27 +18,28 @@ _HEIGHT = 0.72
 def waterfall(
     parts: Sequence[tuple[str, float]], title: str, **paper: Unpack[Paper]
 ) -> Figure:
-    """Bars from the error of the present down to what is left without its causes.
-    `parts` are causes and the mean square, in m^2, that is left without each and all before it; the first is the error.
+    """Bars from the present error down to the rest without its causes.
+
+    `parts` are causes with the mean square [m^2] that remains without this cause and
+    all causes before it. The first entry is the whole error.
     """
     sheet = Sheet(9.0, 1.2 + 0.42 * (len(parts) + 1), paper)
     axes = sheet.plots(1)[0, 0]
-    ends, names = (
-        [end for _, end in parts],
-        ["error now", *(cause for cause, _ in parts[1:]), "if nothing were late"],
-    )
+    ends = [end for _, end in parts]
+    names = ["error now", *(cause for cause, _ in parts[1:]), "without delays"]
     steps = [*itertools.pairwise(ends), (ends[-1], 0.0)]
     for row, (before, after) in enumerate([(ends[0], 0.0), *steps]):
-        is_end, root = row in (0, len(steps)), f"{math.sqrt(before):.2f} m"
+        is_end = row in (0, len(steps))
+        root = f"{math.sqrt(before):.2f} m"
         colour = GREY if is_end else SENSORS[0] if before > after else SENSORS[1]
         axes.barh(row, before - after, left=after, height=_HEIGHT, color=colour)
         label = (
             root
             if is_end
-            else f"{round(100.0 * (before - after) / ends[0])} % of it: {root} to {math.sqrt(after):.2f} m"
+            else f"{round(100.0 * (before - after) / ends[0])} %: {root} to {math.sqrt(after):.2f} m"
         )
         axes.text(max(before, after) + 0.01 * max(ends), row, label, va="center")
-        if row:  # from the bar above
+        if row:  # connect with the bar above
             axes.plot(
                 [before, before],
                 [row - 1.0 + _HEIGHT / 2, row - _HEIGHT / 2],

@@ -1,4 +1,4 @@
-"""The figure of ego, detections, tracks and truth on the map."""
+"""Figure of the ego, detections, tracks and truth on the map."""
 
 from typing import NamedTuple, Unpack
 
@@ -24,21 +24,25 @@ from fgtrack.show.figures.style import (
 )
 from fgtrack.show.palette import PALETTE
 
-_NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
-_AROUND_S = 0.4  # of the life of a track before and after the moment of the close-up
-_LEAST_M = 4.0  # half a side of the close-up
+# With more objects, all share two entries of the legend.
+_NAMED_OBJECTS = 8
+# Time before and after the moment of the close-up.
+_AROUND_S = 0.4
+# Least half side of the close-up.
+_LEAST_M = 4.0
 _DETECTIONS = "#8C7A1F"
 
 
 @styled
 def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`; beside it a close-up.
+    """Ego, detections, tracks and truth on the map that `config.yaml` names in `map.track`, with a close-up.
 
-    Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
-    object that it is paired with, and is black where it is paired with none. Without truth every confirmed
-    track has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections; what lies
-    outside is counted. The close-up follows for 0.8 s the track with the most updates in so short a time. Raises
-    `DataError` if `config.yaml` is not YAML, or the map that it names is not a map.
+    Truth is a broad pale line, so parts without a track remain visible. A track has the
+    colour of its true object, and is black without one. Without truth every confirmed
+    track has its own colour. The picture contains the map, the ego, the truth, and most
+    of the tracks and detections. The title counts those outside. The close-up shows the
+    track with the most updates within 0.8 s. Raises `DataError` for an invalid
+    `config.yaml`, or an invalid map.
     """
     one = one_evaluated(run)
     maps, notes = roads(one.run)
@@ -47,7 +51,8 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     tracks = (
         every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     )
-    detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
+    detections_m = placed(one.run).position_m
+    ego_m = _positions(one.run.tables["ego"])
     required = [
         *bounds_m,
         ego_m,
@@ -117,9 +122,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         for each in samples_m
     )
     if outside:
-        text.append(
-            f"{outside} rows of tracks and detections are outside of the picture"
-        )
+        text.append(f"{outside} rows of tracks and detections are outside the picture")
     legend_above(overview, 1.0 / (1 + len(close_ups)))
     sheet.title("\n".join(text))
     return sheet.figure
@@ -134,11 +137,12 @@ class _Window(NamedTuple):
 
 
 def _window(run: Run) -> _Window | None:
-    """Around the track with the most updates in `_AROUND_S` before and after, at the first such stamp of them."""
-    used, around_ns = (
-        run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0),
-        nanoseconds(_AROUND_S),
-    )
+    """Return the window around the track with the most updates within `_AROUND_S` of a stamp.
+
+    None without updates. The first of several such stamps is used.
+    """
+    used = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0)
+    around_ns = nanoseconds(_AROUND_S)
     busiest: tuple[int, int, int] = (0, 0, 0)
     for track_id in np.unique(used["track_id"]).tolist():
         stamps_ns = np.sort(used["stamp_ns"][used["track_id"] == track_id])
@@ -152,7 +156,8 @@ def _window(run: Run) -> _Window | None:
     positions_m = _positions(tracks.where((tracks["track_id"] == track_id) & is_near))
     if not count or not len(positions_m):
         return None
-    low_m, high_m = positions_m.min(axis=0), positions_m.max(axis=0)
+    low_m = positions_m.min(axis=0)
+    high_m = positions_m.max(axis=0)
     return _Window(
         -earlier_ns,
         (low_m + high_m) / 2.0,
@@ -161,7 +166,7 @@ def _window(run: Run) -> _Window | None:
 
 
 def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
-    """True for stamps of the time of `window`, for all where it is None."""
+    """Mask of the stamps in the time of `window`; all True without a window."""
     middle_ns, reach_ns = (
         (0, np.inf)
         if window is None
@@ -171,18 +176,16 @@ def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
 
 
 def _positions(table: Columns) -> FloatArray:
-    """Shape (n, 2)."""
+    """Positions x, y of the rows, shape (n, 2)."""
     return np.stack([table["x_m"], table["y_m"]], axis=-1)
 
 
 def _draw_objects(
     axes: Axes, one: EvaluatedRun, tracks: Columns, window: _Window | None
 ) -> None:
-    """Truth and tracks, in their colours; without truth every track has one of its own."""
-    ids, step_ns = (
-        one.run.tables["tracks"]["track_id"],
-        usual_step_ns(one.run.tables["tracks"]["now_ns"]),
-    )
+    """Draw truth and tracks in the colours of the objects; without truth every track has its own colour."""
+    ids = one.run.tables["tracks"]["track_id"]
+    step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
     owners = (
         np.searchsorted(np.unique(ids), tracks["track_id"])
         if one.matching is None

@@ -1,4 +1,4 @@
-"""A figure for a page: its width, font and style, or the axes of another figure that it is drawn into."""
+"""Size, font and style of a figure for a page, or the given axes into which it is drawn."""
 
 import logging
 import math
@@ -22,7 +22,7 @@ from fgtrack.show.figures.style import LETTER, StyledFigure, grow, size_in
 _logger = logging.getLogger(__name__)
 P = ParamSpec("P")
 T = TypeVar("T")
-#: Where matplotlib's own value is unchanged: how figures look. Sizes of texts follow `font.size`.
+#: Settings of figures, used where the user has not changed matplotlib's default. Text sizes follow `font.size`.
 _STYLE: Mapping[str, Any] = {  # Any: values of rcParams
     "font.size": 9.5,
     "axes.grid": True,
@@ -41,6 +41,7 @@ _STYLE: Mapping[str, Any] = {  # Any: values of rcParams
     "agg.path.chunksize": 20_000,
     "svg.hashsalt": "fgtrack",
 }
+#: Additional settings for a figure as narrow as a column.
 _COLUMN: Mapping[str, Any] = {
     "font.size": 8.0,
     "xtick.major.pad": 2.0,
@@ -49,12 +50,13 @@ _COLUMN: Mapping[str, Any] = {
     "figure.constrained_layout.h_pad": 0.02,
     "figure.constrained_layout.w_pad": 0.02,
     "savefig.dpi": 300,
-}  # of a figure as narrow as a column
+}
 _COLUMN_IN = 5.0
 _UNITS_IN = {"in": 1.0, "cm": 1.0 / 2.54, "mm": 1.0 / 25.4, "pt": 1.0 / 72.27}
 _NARROWEST_IN, _WIDEST_IN = 1.5, 40.0
-_FLATTEN = 0.6  # height ~ width^0.6: texts do not shrink with the figure
-#: Fonts of the same widths, for machines without the commercial one.
+# The height is proportional to width^0.6, because texts do not shrink with the figure.
+_FLATTEN = 0.6
+#: Fonts with the same letter widths, for machines without the commercial font.
 _METRIC_COMPATIBLE: Mapping[str, Sequence[str]] = {
     "Times New Roman": ("Liberation Serif", "STIXGeneral"),
     "Times": ("Liberation Serif", "STIXGeneral"),
@@ -64,32 +66,39 @@ _METRIC_COMPATIBLE: Mapping[str, Sequence[str]] = {
 
 
 class Paper(TypedDict, total=False):
-    """Keywords of every figure; without them it is as wide as a screen, with the settings of `matplotlib.rcParams`."""
+    """Keyword arguments of every figure.
+
+    Without them a figure has the width of a screen and the settings in
+    `matplotlib.rcParams`.
+    """
 
     width: float | str
-    """In inches, or with a unit: "3.4in", "86mm". The figure has no title then; a paper has captions."""
+    """Width in inches, or with a unit: "3.4in", "86mm". The figure then has no title, as a paper has captions."""
     font: str
-    """Family of the font, as "Times New Roman"."""
+    """Font family, for instance "Times New Roman"."""
     style: str | Path
-    """A style of matplotlib: a file (.mplstyle) or the name of a shipped one. It wins over rcParams."""
+    """Style of matplotlib: a file (.mplstyle) or the name of a shipped style. It overrides rcParams."""
     ax: Axes
-    """Axes of a figure of one's own to draw into; a figure of several plots divides them."""
+    """Axes of another figure to draw into. A figure with several plots subdivides them."""
 
 
 def inches(width: float | str) -> float:
-    """Return a width in inches. Raises `CallError` if it is not a width between 1.5 and 40 inches."""
+    """Return `width` in inches.
+
+    Raises `CallError` if it is not a width between 1.5 and 40 inches.
+    """
     text = str(width).strip()
     match = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*(in|cm|mm|pt|)", text)
     value = float(match[1]) * _UNITS_IN[match[2] or "in"] if match else math.nan
     if not _NARROWEST_IN <= value <= _WIDEST_IN:
         raise CallError(
-            f"width {text!r}: not between {_NARROWEST_IN:g} and {_WIDEST_IN:g} inches, write 3.4in, 8.6cm or 86mm"
+            f"width {text!r}: must be between {_NARROWEST_IN:g} and {_WIDEST_IN:g} inches, write 3.4in, 8.6cm or 86mm"
         )
     return value
 
 
 def styled(function: Callable[P, T]) -> Callable[P, T]:
-    """Return `function` run with the style of fgtrack and its keywords of `Paper`; rcParams are restored."""
+    """Decorator that runs `function` with the style of fgtrack and of its `Paper` arguments; it restores rcParams."""
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -100,16 +109,20 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def is_column(paper: Mapping[str, Any]) -> bool:
-    """True if the figure is as narrow as a column. Raises `CallError` as `inches`."""
+    """True if the figure is as narrow as a column.
+
+    Raises `CallError` for an invalid width.
+    """
     return "width" in paper and inches(paper["width"]) < _COLUMN_IN
 
 
 def settings(
     paper: Mapping[str, Any],
 ) -> Any:  # Any: keys of rcParams are a Literal of all names
-    """Return the rcParams of a figure on `paper`: the user's own, else those of fgtrack; then its style and font.
+    """Return the rcParams of a figure on `paper`.
 
-    Raises `CallError` if the width, the style or the font is not usable.
+    The user's own values win over those of fgtrack, and the style and font of `paper`
+    over both. Raises `CallError` for an invalid width, style or font.
     """
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams
@@ -125,36 +138,36 @@ def settings(
             )
         except (OSError, ValueError) as error:
             raise CallError(
-                f"style {paper['style']}: cannot be used ({error}), name an .mplstyle file or a style of matplotlib"
+                f"style {paper['style']}: cannot be used ({error}), give an .mplstyle file or a style of matplotlib"
             ) from error
     if "font" in paper:
         result["font.family"] = _families(paper["font"])
     return result
 
 
-@cache  # so that a substitute is named once
+@cache  # report a substitute only once
 def _families(font: str) -> list[str]:
     families = [font, *_METRIC_COMPATIBLE.get(font, ())]
     known = {entry.name for entry in font_manager.fontManager.ttflist} | set(
         font_manager.font_family_aliases
     )
-    there = [name for name in families if name in known]
-    if not there:
-        raise CallError(
-            f"font {font!r}: not installed, choose one of `fc-list : family`"
-        )
-    if there[0] != font:
+    installed = [name for name in families if name in known]
+    if not installed:
+        raise CallError(f"font {font!r}: not installed, use one of `fc-list : family`")
+    if installed[0] != font:
         _logger.warning(
-            "font %r is not installed, %r of the same widths is used", font, there[0]
+            "font %r is not installed, using %r with equal letter widths",
+            font,
+            installed[0],
         )
-    return there
+    return installed
 
 
 class Sheet:
-    """Canvas of a figure: a figure of its own, or the axes that the caller gave."""
+    """Canvas of a figure: a new figure, or the axes that the caller gave."""
 
     def __init__(self, width_in: float, height_in: float, paper: Paper) -> None:
-        """Make a figure of this usual size, in the width that `paper` wants."""
+        """Create a figure of this default size, scaled to the width in `paper`."""
         self._ax = paper.get("ax")
         self.has_title = self._ax is None and "width" not in paper
         if self._ax is None:
@@ -183,20 +196,20 @@ class Sheet:
         elif rows * columns == 1:
             return np.array([[self._ax]], dtype=object)
         else:
-            where = self._ax.get_subplotspec()
-            if where is None:
+            cell = self._ax.get_subplotspec()
+            if cell is None:
                 raise CallError(
-                    f"ax: a figure of {rows * columns} plots needs axes made by `plt.subplots`"
+                    f"ax: a figure of {rows * columns} plots needs axes from `plt.subplots`"
                 )
             self._ax.set_axis_off()
-            grid = where.subgridspec(rows, columns, **ratios)
+            grid = cell.subgridspec(rows, columns, **ratios)
         result: NDArray[Any] = np.asarray(
             grid.subplots(sharex=sharex, sharey=sharey, squeeze=False), dtype=object
         )
         return result
 
     def title(self, text: str) -> None:
-        """Write `text` above the figure, where it has a title, broken into lines that are no wider than it."""
+        """Write `text` above the figure, wrapped to its width; does nothing for a figure without a title."""
         if self.has_title:
             width = max(
                 10,

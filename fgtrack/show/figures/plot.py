@@ -1,6 +1,6 @@
-"""Figures of runs by name: each function takes runs (or their folders) and returns a matplotlib Figure.
+"""Figures of runs by name. Each function takes runs or their folders, and returns a matplotlib Figure.
 
-`errors([run, other]).savefig("errors.pdf")` writes one.
+`errors([run, other]).savefig("errors.pdf")` writes a figure.
 """
 
 import re
@@ -41,12 +41,14 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    """Return the names of the figures: those that `fgtrack.plot.` completes to."""
+    """Return the names of the figures, for completion of `fgtrack.plot.`."""
     return sorted(__all__)
 
 
-_SHOWN = 3  # of objects, and of runs where they are many: the worst are drawn
-_MOST_RUNS = 6  # that have figures of their own
+# Number of figures per kind, for the worst of many objects or runs.
+_SHOWN = 3
+# Largest number of runs that all have their own figures.
+_MOST_RUNS = 6
 
 
 @dataclass(frozen=True)
@@ -55,13 +57,16 @@ class Planned:
 
     name: str
     draw: Callable[..., Figure]
-    """Takes the keywords of `Paper`."""
+    """Function that draws it; it takes the keyword arguments of `Paper`."""
     is_extra: bool = False
-    """True if it is one of many, and drawn on request only."""
+    """True if it is one of many figures of its kind, which is drawn only on request."""
 
 
 def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
-    """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras."""
+    """Return every figure that `runs` have data for.
+
+    With many objects or runs, only the figures of the worst ones are no extras.
+    """
     extra = (
         {one.label for one in sorted(runs, key=_rmse_m)[:-_SHOWN]}
         if len(runs) > _MOST_RUNS
@@ -82,17 +87,14 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
             Planned(f"{name}_{one.label}", partial(draw, one), one.label in extra)
             for one in mine
         ]
-    streams: dict[
-        bytes, EvaluatedRun
-    ] = {}  # estimators of one stream share this figure
+    # Estimators on the same data share the figure of arrivals.
+    streams: dict[bytes, EvaluatedRun] = {}
     for one in runs:
         if (receipts_ns := one.run.tables["updates"]["receipt_ns"]).size:
             streams.setdefault(np.sort(receipts_ns).tobytes(), one)
     for k, one in enumerate(streams.values()):
-        ending, is_extra = (
-            f"_{one.label}" if len(streams) > 1 else "",
-            len(streams) > _MOST_RUNS and k >= _SHOWN,
-        )
+        ending = f"_{one.label}" if len(streams) > 1 else ""
+        is_extra = len(streams) > _MOST_RUNS and k >= _SHOWN
         plans.append(Planned(f"arrivals{ending}", partial(arrivals, one), is_extra))
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
     worst = sorted(
@@ -110,7 +112,10 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
 
 
 def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
-    """Position RMSE of a run, of one object or over all; infinite where nothing is tracked, -1 without truth of it."""
+    """Position RMSE of a run over one object, or over all objects.
+
+    Infinity if nothing is tracked, -1 without truth.
+    """
     truth = one.metrics.truth
     if truth is None or (object_id is not None and object_id not in truth.objects):
         return -1.0
@@ -121,7 +126,7 @@ def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
 
 
 def planned_sweep(table: SweepTable) -> list[Planned]:
-    """Return the figures of a sweep, one for each metric; a few of them are no extras."""
+    """Return the figures of a sweep, one for each metric; only a few of them are no extras."""
     first, rest = sweep_metrics(table)
     return [
         Planned(f"sweep_{metric}", partial(sweep, table, metric), metric in rest)
@@ -132,7 +137,7 @@ def planned_sweep(table: SweepTable) -> list[Planned]:
 def drawn(
     plans: Iterable[Planned], every: bool = False, **paper: Unpack[Paper]
 ) -> Iterator[tuple[str, Figure]]:
-    """Return the figures of `plans`, with their names; extras only where `every` is set."""
+    """Draw `plans` and return the figures with their names; extras only if `every` is True."""
     return (
         (item.name, item.draw(**paper)) for item in plans if every or not item.is_extra
     )
@@ -141,7 +146,7 @@ def drawn(
 def save_named(
     named: Iterable[tuple[str, Figure]], folder: Path, form: str
 ) -> list[Path]:
-    """Write figures into `folder`, each into a file of its name."""
+    """Write each figure into `folder`, to a file with its name, and return the paths."""
     slug = re.compile(r"[^A-Za-z0-9.-]+")
     return [
         save(figure, folder / f"{slug.sub('_', name).strip('_')}.{form}")

@@ -1,4 +1,4 @@
-"""The figure of the innovations."""
+"""Figure of the innovations."""
 
 from itertools import cycle
 from typing import Unpack
@@ -31,13 +31,14 @@ _DENSITIES = {"m": "1/m", "rad": "1/rad", "mps": "s/m"}
 
 @styled
 def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
+    """Innovations by sensor, a row for each component: over time, and their distribution.
 
-    Bins and axes cover the bulk of every sensor's residuals; the legend counts those outside. Raises `DataError` if the
-    run has no innovations.
+    Axes and bins cover most of every sensor's innovations. The legend counts those
+    outside. Raises `DataError` if the run has no innovations.
     """
     one = one_evaluated(run)
-    values, updates = innovations.residuals(one.run), one.run.tables["updates"]
+    values = innovations.residuals(one.run)
+    updates = one.run.tables["updates"]
     time_s = (updates["stamp_ns"] - start_ns([one])) / NS_PER_S
     sensors = np.unique(updates["sensor"]).tolist()
     names = [name for name in RESIDUAL_NAMES if np.isfinite(values[name]).any()]
@@ -45,7 +46,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         names = [name for name in names if name not in ("x_m", "y_m")]
     if not names:
         raise DataError(
-            f"{one.label}: has no innovations, so there are no residuals to draw"
+            f"{one.label}: no innovations, so there are no residuals to draw"
         )
     sheet = Sheet(10.0, 0.8 + 2.4 * len(names), paper)
     rows = sheet.plots(len(names), 2, widths=(2, 1))

@@ -1,4 +1,4 @@
-"""Style of figures, and their files: equal figures, equal bytes."""
+"""Style of figures and of their files. Equal figures give equal bytes."""
 
 import base64
 import io
@@ -27,21 +27,24 @@ from fgtrack.show.palette import CurveStyle, styles
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
 GREY = "#777777"
-_PAUSE_STEPS = (
-    3  # a line is not drawn across a pause that is longer than as many usual steps
-)
-LETTER, _LINE = (
-    0.58,
-    1.5,
-)  # width of a letter and height of a line over the size of the font
-_MOST_ENTRIES = 12  # of a legend
-_HANDLE = 8  # characters that the line before an entry and the space around it take
-_BESIDE_IN = 0.6  # what the labels of an axis take of the width
-_FREE_LINES = 2  # of a legend for which figures have room
-_BEYOND = 3.0  # interquartile ranges beyond the quartiles that still belong to the bulk
+# A line is interrupted at a pause of more than this number of usual steps.
+_PAUSE_STEPS = 3
+# Width of a letter and height of a text line, in units of the font size.
+LETTER = 0.58
+_LINE = 1.5
+# Largest number of entries of a legend.
+_MOST_ENTRIES = 12
+# Width of the line before a legend entry and of its margins, in characters.
+_HANDLE = 8
+# Width of the labels of an axis, in inches.
+_BESIDE_IN = 0.6
+# Number of legend lines that fit without a higher figure.
+_FREE_LINES = 2
+# Values within this number of interquartile ranges from the quartiles belong to the bulk.
+_BEYOND = 3.0
 _MARGIN = 0.05
 _MARK = "fgtrack figure"
-#: Formats of files, with who made them and without what would differ from one writing to the next.
+#: Metadata of files by format: the creator, but no date or version, so that equal figures give equal files.
 FORMATS: Mapping[str, Mapping[str, str | None]] = {
     "png": {"Creator": _MARK, "Software": None},
     "svg": {"Creator": _MARK, "Date": None},
@@ -50,7 +53,7 @@ FORMATS: Mapping[str, Mapping[str, str | None]] = {
 
 
 class StyledFigure(Figure):
-    """A figure that keeps the settings with which it was made."""
+    """Figure that keeps the settings of its creation."""
 
     def __init__(self, figsize: tuple[float, float]) -> None:
         super().__init__(figsize=figsize)
@@ -59,17 +62,16 @@ class StyledFigure(Figure):
         }
 
     def draw(self, renderer: Any) -> None:  # Any: matplotlib does not export the type
-        """Draw it, see `matplotlib.figure.Figure.draw`; control characters in names out of files are escaped."""
+        """Draw the figure, see `matplotlib.figure.Figure.draw`; control characters in texts are escaped."""
         for text in self.findobj(Text):
             text.set_text(printable_lines(text.get_text()))
         with mpl.rc_context(self._settings), warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", "Glyph .* missing"
-            )  # of a script that the font lacks: an empty box
+            # A missing character is drawn as an empty box.
+            warnings.filterwarnings("ignore", "Glyph .* missing")
             super().draw(renderer)
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:  # Any: those of matplotlib
-        """Write it, see `matplotlib.figure.Figure.savefig`."""
+        """Write the figure, see `matplotlib.figure.Figure.savefig`."""
         with mpl.rc_context(self._settings):
             super().savefig(*args, **kwargs)
 
@@ -80,7 +82,7 @@ class StyledFigure(Figure):
 
 
 def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, CurveStyle]:
-    """Return the styles of the curves of the runs, by label: colours are those of the estimators."""
+    """Return the curve style of each run by label; the colours are those of the estimators."""
     result = styles(
         [str(item.run.meta.get("estimator") or item.label) for item in runs]
     )
@@ -88,9 +90,9 @@ def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, CurveStyle]:
 
 
 def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> None:
-    """Legend above a plot, where it hides nothing; of many entries the first.
+    """Draw a legend above a plot, with at most twelve entries.
 
-    It takes `share` of the width of the figure; small markers are shown larger by `markerscale`.
+    Its width is `share` of the figure's width. `markerscale` enlarges small markers.
     """
     handles, labels = axes.get_legend_handles_labels()
     figure = axes.get_figure(root=True)
@@ -129,24 +131,24 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
 
 
 def size_in(name: str) -> float:
-    """Return the size in inches of the texts of this setting."""
+    """Return the text size of the setting `name`, in inches."""
     return float(FontProperties(size=_RC[name]).get_size_in_points()) / 72.0
 
 
 def grow(figure: Figure, name: str, lines: int) -> None:
-    """Make room for `lines` of the texts of this setting above the plots."""
+    """Increase the height of `figure` by `lines` text lines of the setting `name`."""
     figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE * size_in(name))
 
 
 def log_axis(axis: Axis) -> None:
-    """Plain numbers at 1, 2 and 5 of every decade of a logarithmic `axis`."""
+    """Set plain numbers as ticks at 1, 2 and 5 of every decade of a logarithmic `axis`."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
 
 
 def usual_step_ns(stamps_ns: IntArray) -> float:
-    """Median step between distinct stamps; infinite where there is only one."""
+    """Median step between distinct stamps; infinity for a single stamp."""
     steps_ns = np.diff(np.unique(stamps_ns))
     return float(np.median(steps_ns)) if len(steps_ns) else math.inf
 
@@ -154,7 +156,10 @@ def usual_step_ns(stamps_ns: IntArray) -> float:
 def broken_line(
     stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Points in order of time, usually `step_ns` apart, with a NaN in every pause, so that no line is drawn there."""
+    """Return points in order of time, with a NaN in every pause, so that the line is interrupted there.
+
+    `step_ns` is the usual step between points.
+    """
     order = np.argsort(stamps_ns, kind="stable")
     pauses = np.flatnonzero(np.diff(stamps_ns[order]) > _PAUSE_STEPS * step_ns) + 1
     return np.insert(x[order], pauses, np.nan), np.insert(y[order], pauses, np.nan)
@@ -163,8 +168,12 @@ def broken_line(
 def bulk(
     samples: Iterable[FloatArray], required: Iterable[FloatArray] = ()
 ) -> tuple[float, float]:
-    """Range with the bulk of each of `samples` and all of `required`, and a margin; (0, 1) without finite values."""
-    lows, highs = [], []
+    """Return a range with a margin that covers the bulk of `samples`, and all of `required`.
+
+    (0, 1) without finite values.
+    """
+    lows = []
+    highs = []
     for values, is_required in (
         *((each, False) for each in samples),
         *((each, True) for each in required),
@@ -177,15 +186,15 @@ def bulk(
             highs.append(min(float(known.max()), third + reach))
     if not lows:
         return 0.0, 1.0
-    low, high = min(lows), max(highs)
-    margin = max(
-        _MARGIN * (high - low), 1e-6, 1e-9 * max(abs(low), abs(high))
-    )  # wide enough for bins of it
+    low = min(lows)
+    high = max(highs)
+    # The least margin keeps histogram bins distinct.
+    margin = max(_MARGIN * (high - low), 1e-6, 1e-9 * max(abs(low), abs(high)))
     return low - margin, high + margin
 
 
 def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
-    """Write `figures` as the pages of one PDF, without date and version."""
+    """Write `figures` as pages of a PDF, without date and version."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     with PdfPages(file, metadata=dict(FORMATS["pdf"])) as pages:
@@ -194,7 +203,7 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 
 def png(figure: Figure, dpi: float = 150.0) -> bytes:
-    """`figure` as a small PNG of 256 colours, without date and version."""
+    """Return `figure` as a small PNG with 256 colours, without date and version."""
     full, small = io.BytesIO(), io.BytesIO()
     figure.savefig(full, format="png", dpi=dpi)
     picture = Image.open(full).convert("RGB")
@@ -205,6 +214,6 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write `figure` as PNG, SVG or PDF, by the suffix, without date and version: equal figures, equal files."""
+    """Write `figure` as PNG, SVG or PDF, by the suffix of `path`, without date and version; return `path`."""
     figure.savefig(path, metadata=dict(FORMATS[path.suffix.removeprefix(".")]))
     return path

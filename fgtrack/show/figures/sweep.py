@@ -1,4 +1,4 @@
-"""Figures of a sweep: a metric over the grid, mean and 95 % interval over the seeds; and error against delay."""
+"""Figures of a sweep: a metric over the grid with its 95 % interval over seeds, and error against delay."""
 
 import math
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import legend_above, log_axis
 from fgtrack.show.palette import style_of, styles
 
-#: Metrics with a name for people; the others are called by their column.
+#: Names of metrics; other metrics are named by their column.
 _NAMES: Mapping[str, str] = {
     "truth.overall.errors.position_m.rmse": "position RMSE [m]",
     "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
@@ -35,31 +35,33 @@ _NAMES: Mapping[str, str] = {
     "multi_object.identity.idf1": "IDF1",
     "multi_object.hota.hota": "HOTA",
 }
-_POSITION, _LAGGED = (
-    "truth.overall.errors.position_m.rmse",
-    "lagged.*.errors.position_m.rmse",
-)
+_POSITION = "truth.overall.errors.position_m.rmse"
+_LAGGED = "lagged.*.errors.position_m.rmse"
 _UNITS = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "mps2": "m/s²"} | {
     name: name for name in ("s", "ms", "ns", "m", "rad")
 }
 _EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
-#: Those that are drawn where nothing else is asked for.
+#: Metrics that are drawn by default.
 _FIRST = (*tuple(_NAMES)[:2], "consistency.position_nees.mean")
-#: Of the rest, those with a better and a worse.
+#: Patterns of all metrics that can be drawn: for each it is clear which values are better.
 _REST = (
     *_NAMES,
     "truth.overall.errors.*.rmse",
     "consistency.nis.*.mean",
     "lagged.*.errors.position_m.rmse",
 )
-_WIDE = 3  # panels side by side
-_LOG_FROM = 20.0  # largest over smallest value
-_DODGE = 0.012  # of the axis, between the error bars of two estimators
-_NAMED_STEPS = 8  # more values of the horizontal axis than these have no tick each
+# Largest number of panels side by side.
+_WIDE = 3
+# Ratio of the largest to the smallest value from which the axis is logarithmic.
+_LOG_FROM = 20.0
+# Shift between the error bars of two estimators, as a share of the axis.
+_DODGE = 0.012
+# Largest number of values of the horizontal axis that all have a tick.
+_NAMED_STEPS = 8
 
 
 def sweep_metrics(table: SweepTable) -> tuple[list[str], list[str]]:
-    """The metrics of `table` to draw: the first ones, and the rest."""
+    """Return the metrics of `table` that are drawn by default, and the others."""
     known = [name for name in table.metrics if not table.means(name).empty]
     ordered = [
         name for pattern in _REST for name in known if fnmatchcase(name, pattern)
@@ -75,12 +77,14 @@ def sweep(
 ) -> Figure:
     """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
 
-    The axis with the most numbers is the horizontal one; of the others every combination has a panel. `table` is the
-    sweep or its folder, `metric` a column of sweep.csv. Raises `CallError` if there is no such sweep or metric, and
-    `DataError` if it has no value.
+    The axis with the most numeric values is horizontal. Each combination of the other
+    axes has a panel. `table` is the sweep or its folder, and `metric` a column of
+    sweep.csv. Raises `CallError` for an unknown sweep or metric, and `DataError` for a
+    metric without values.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    names, means = table.shown_axes or [""], _means(table, metric)
+    names = table.shown_axes or [""]
+    means = _means(table, metric)
     if means.empty:
         raise DataError(
             f"{metric}: no cell of the sweep has a value, so there is nothing to draw"
@@ -108,9 +112,8 @@ def sweep(
                 "at", kind="stable"
             )
             at, mean, half = mine[["at", "mean", "half"]].to_numpy().T
-            at += (
-                _DODGE * width * (k - (len(estimators) - 1) / 2.0)
-            )  # so that bars do not hide each other
+            # Shift the error bars, so that they do not hide each other.
+            at += _DODGE * width * (k - (len(estimators) - 1) / 2.0)
             line = {
                 "color": its.colour,
                 "ls": its.line if are_numbers[across] else "none",
@@ -158,9 +161,10 @@ def sweep(
             ncols=4,
             frameon=False,
         )
-    few, most = means["seeds"].min(), means["seeds"].max()
-    of = f"{few} to {most}" if few < most else str(most)
-    bars = f"mean over {of} seeds, bars: 95 % interval" if most > 1 else "one seed"
+    few = means["seeds"].min()
+    most = means["seeds"].max()
+    number = f"{few} to {most}" if few < most else str(most)
+    bars = f"mean over {number} seeds, bars: 95 % interval" if most > 1 else "one seed"
     sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
     return sheet.figure
 
@@ -169,11 +173,12 @@ def sweep(
 def error_against_delay(
     table: SweepTable | Path | str | None = None, **paper: Unpack[Paper]
 ) -> Figure:
-    """Position error against the mean delay of a sensor, with 95 % intervals: what each method makes of late data.
+    """Position error against the mean delay of a sensor, a line for each estimator, with 95 % intervals.
 
-    `table` is a sweep (or its folder) over delays alone, in seconds; by default the result of the shipped sweep
-    `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed. Raises `CallError`
-    if there is no such sweep, and `DataError` if it is not over one axis of delays.
+    `table` is a sweep, or its folder, over a single axis of delays in seconds. The
+    default is the stored result of the shipped sweep `error_against_delay`: a car, a
+    late LiDAR and a RADAR, ten seeds. Raises `CallError` for an unknown sweep, and
+    `DataError` for a sweep without a single axis of delays.
     """
     if table is None:
         with as_file(files(__package__) / "error_against_delay") as folder:
@@ -184,7 +189,7 @@ def error_against_delay(
     (delay, *others), points = table.shown_axes or [""], curves[_POSITION]
     if others or points.empty or not _are_numbers(points[delay]):
         raise DataError(
-            "the sweep is not over one axis of delays with position errors, so it is not drawn against delay"
+            "the sweep must have a single axis of delays, and position errors, for a figure against delay"
         )
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
@@ -193,13 +198,15 @@ def error_against_delay(
         for name, mine in means.sort_values("ms", kind="stable").groupby(
             "estimator", sort=False
         ):
-            its, later = style_of(name), metric_words(metric).partition(", ")[2]
+            its = style_of(name)
+            later = metric_words(metric).partition(", ")[2]
             line, marker, label = (
                 (":", ".", f"{name}, {later}")
                 if later
                 else (its.line, its.marker, name)
             )
-            low, high = mine["mean"] - mine["half"], mine["mean"] + mine["half"]
+            low = mine["mean"] - mine["half"]
+            high = mine["mean"] + mine["half"]
             axes.fill_between(mine["ms"], low, high, color=its.colour, alpha=0.18, lw=0)
             axes.plot(
                 mine["ms"],
@@ -225,7 +232,7 @@ def error_against_delay(
 def _means(
     table: SweepTable, metric: str
 ) -> Any:  # Any: a DataFrame, whose columns have no types
-    """Return the means of `table` with `half`, that of the 95 % interval (t; 0 of one seed)."""
+    """Return the means of `table`, with the half-width `half` of the 95 % interval (t; 0 for a single seed)."""
     frame = table.means(metric)
     frame["half"] = np.nan_to_num(
         stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * frame["standard_error"]
@@ -238,7 +245,7 @@ def _are_numbers(cells: Any) -> bool:
 
 
 def metric_words(metric: str) -> str:
-    """Name of a metric for people, with its unit."""
+    """Return the display name of a metric, with its unit."""
     if metric in _NAMES:
         return _NAMES[metric]
     parts = metric.split(".")
@@ -252,7 +259,7 @@ def metric_words(metric: str) -> str:
 
 
 def words(name: str) -> str:
-    """Words for the key `name` of a configuration or a table, with its unit: "delay [s]" for "sensors.x.delay_s"."""
+    """Return the display name of a configuration key or column, with its unit: "delay [s]" for "sensors.x.delay_s"."""
     plain = ".".join(name.split(".")[-2:]).replace(".", " ")
     stem, _, unit = plain.rpartition("_")
     text, end = (stem, f" [{_UNITS[unit]}]") if stem and unit in _UNITS else (plain, "")
