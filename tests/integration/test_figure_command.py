@@ -47,4 +47,4 @@ def test_a_sweep_is_drawn_alone(
         assert message in capsys.readouterr().err
     (tmp_path / "sweep" / "sweep.csv").write_text(HEADER)
     assert command(["figure", sweep, *out]) == 1
-    assert "holds no rows of a sweep" in capsys.readouterr().err
+    assert "no rows of a sweep" in capsys.readouterr().err

@@ -127,7 +127,7 @@ def test_a_run_that_falls_behind_for_good_is_not_ranked(tmp_path: Path) -> None:
         {"fast (smoother)": 0.02 * np.sqrt(59 / 60)}, rel=1e-6
     )
     assert tables.verdict[-1] == (
-        "slow (smoother) falls behind for good (load 153%): not ranked, the longer the run, the worse."
+        "slow (smoother) cannot keep up (load 153%): it is not ranked, as its delay grows with the run."
     )
 
 
@@ -137,10 +137,13 @@ def test_a_slow_method_loses_what_it_wins_by_being_exact(tmp_path: Path) -> None
     tables = compare(exact, rough, streaming=True)
     assert "exact (smoother) is best at the newest stamp" in tables.verdict[0]
     assert (
-        "rough (smoother) is best where each is evaluated when it is ready"
+        "rough (smoother) is best evaluated when the states are ready"
         in tables.verdict[-2]
     )
-    assert "exact (smoother) is best where users also predict" in tables.verdict[-1]
+    assert (
+        "exact (smoother) is best evaluated when ready, with states predicted"
+        in tables.verdict[-1]
+    )
     assert rmse(tables, READY) == pytest.approx(
         {
             "rough (smoother)": np.hypot(0.2, 0.02),

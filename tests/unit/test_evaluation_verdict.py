@@ -104,7 +104,7 @@ def test_a_run_too_short_for_an_interval_is_not_called_a_tie(plain: Metrics) -> 
     unknown = Estimate(0.05, float("nan"), float("nan"), 0)
     assert first(plain, compared(a=None, b=unknown)) == (
         "The difference between a and b at the newest stamp is not resolved (position RMSE 0.400 m, b is worse by "
-        "0.050 m, too short a run for an interval)."
+        "0.050 m, the run is too short for an interval)."
     )
 
 
@@ -122,8 +122,8 @@ def test_noise_that_does_not_fit_is_named_with_its_cure(plain: Metrics) -> None:
     assert noise == (
         "The configured noise is too small (judged by a): NEES of the position 13.4 "
         "(expected 2, 95 % interval 9.0 to 18), NIS of radar 26.5 (expected 4). "
-        "`fgtrack advise --tune` fits it, or reports what has to be corrected first; "
-        "the order of the runs may change then."
+        "`fgtrack advise --tune` fits the noise, or reports the problem to solve first; "
+        "this may change the order of the runs."
     )
     large = replace(FITS, nis={"radar": ChiSquareMean(500, 1.0, 4.0)})
     both = replace(TOO_SMALL, nis=large.nis)
@@ -155,14 +155,14 @@ def test_a_large_nees_that_may_be_chance_is_no_reason_to_tune_and_none_to_say_th
         position_nees_interval=Estimate(5.0, 1.0, 9.0, 3),
     )
     assert verdict(metrics_of(plain, a=chance), []) == (
-        "Run too short to assess the noise (judged by a): "
+        "The run is too short to assess the noise (judged by a): "
         "NEES of the position 5.00 (expected 2, 95 % interval 1.0 to 9.0).",
     )
 
 
 def test_runs_that_cannot_be_paired_are_told_in_one_line(plain: Metrics) -> None:
     (line, *noise) = verdict(metrics_of(plain, a=FITS, b=FITS), [])
-    assert "Not all runs are of the same recording" in line
+    assert "The runs differ in recording, truth or evaluation settings" in line
     assert len(noise) == 2
     without: Mapping[str, Metrics] = {name: replace(plain, truth=None) for name in "ab"}
     assert verdict(without, [])[0] == "Without truth there are no errors to compare."

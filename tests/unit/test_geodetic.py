@@ -273,7 +273,8 @@ def test_a_run_without_an_origin_has_no_map(tmp_path, capsys):
         == 2
     )
     assert (
-        "the map has no latitude and longitude; set `input.origin`" in capsys.readouterr().err
+        "the map has no latitude and longitude; set `input.origin`"
+        in capsys.readouterr().err
     )
 
 

@@ -22,9 +22,9 @@ DataFrame = Any  # pandas, which is untyped and imported where it is used
 NO_VALUE = "-"
 PERCENT = 100.0
 MS = 1e3
-_WIDTH = 120  # of a table as text
-_ANY = 10_000  # wider than any cell
-_LONG = 40  # characters of an HTML cell that may be broken
+_WIDTH = 120  # characters of a table as text
+_ANY = 10_000  # characters, more than any cell has
+_LONG = 40  # characters of an HTML cell from which its lines may be broken
 _MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|", "<": r"\<"})
 _LATEX = str.maketrans(
     {char: f"\\{char}" for char in "&%$#_{}"}
@@ -61,25 +61,27 @@ def _no(record: Record) -> bool:
 
 @dataclass(frozen=True)
 class Column:
-    """One or several numbers of every record, in one cell."""
+    """Column of a table: each cell shows one or several numbers of a record."""
 
     heading: str
-    """Lines, with the unit."""
+    """Heading with the unit, in one or more lines."""
     names: str | Sequence[str] = ""
     """Keys of the numbers, as a sequence or separated by spaces; by default the heading."""
     form: str = "{}"
     """Format of the cell, with a field for each number."""
     scale: float = 1.0
+    """Factor on the numbers."""
     text: Callable[[Value], str] = short
-    """Text of a number, after scaling."""
+    """Function that formats a number after scaling."""
     left: bool = False
-    """True for text, which is aligned left. The leading columns of text name the rows."""
+    """True for text, which is aligned left. The first columns of text name the rows."""
     is_extra: bool = False
-    """True if the column is shown only where the table is shown in full."""
+    """True if the column is shown only in the full table."""
     bold: Callable[[Record], bool] = _no
+    """Function that is True for records with a bold cell."""
 
     def cell(self, record: Record) -> str:
-        """Text of the numbers of `record`; a dash without any."""
+        """Return the text of the numbers of `record`; a dash without any number."""
         names = self.names or self.heading
         values = [
             record.get(name)
@@ -97,7 +99,7 @@ class Column:
 
     @property
     def line(self) -> str:
-        """The heading in one line."""
+        """Heading in a single line."""
         return self.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
 
 
@@ -105,7 +107,7 @@ RUN = Column("run", left=True)
 
 
 def named(name: str, moment: str) -> str:
-    """Return `name` of a quantity with the `moment` before its unit: position_rmse_m."""
+    """Return the name of a quantity with `moment` before its unit, for instance position_rmse_m."""
     quantity, _, unit = name.rpartition("_")
     return f"{quantity}_{moment}_{unit}"
 
@@ -121,20 +123,20 @@ def _text(shown: object) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Records and the columns that show them; `str` gives the text of a terminal of 120 columns."""
+    """Records, and the columns that show them; `str` gives the text for a terminal with 120 columns."""
 
     title: str
     records: Sequence[Record]
-    """Rows: numbers by name with their units; a name that is missing, None and NaN are no value."""
+    """Rows: numbers by name, whose end is the unit. A missing name, None and NaN are missing values."""
     columns: Sequence[Column]
     keys: Sequence[str] = ("run",)
-    """Names that identify a row; the first is the run."""
+    """Names that identify a row; the first one is the run."""
     notes: Sequence[str] = ()
     """Lines below the table."""
     is_detail: bool = False
-    """True for a table that is shown only where a comparison is shown in full."""
+    """True for a table that is shown only in a full comparison."""
     is_main: Callable[[Record], bool] = _yes
-    """True for the records that are shown unless the table is shown in full."""
+    """Function that is True for records which are always shown; the others are shown only in the full table."""
 
     __str__ = _text
 
@@ -151,7 +153,7 @@ class Table:
         return pd.DataFrame([dict(record) for record in self.records])
 
     def plain(self) -> list[dict[str, Value | None]]:
-        """Return the records as JSON values: None where there is no value."""
+        """Return the records as JSON values; None for a missing value."""
         names = dict.fromkeys(name for record in self.records for name in record)
         return [
             {name: _plain(record.get(name)) for name in names}
@@ -159,12 +161,12 @@ class Table:
         ]
 
     def to_csv(self) -> str:
-        """Return all numbers with all digits; an empty cell where there is no value."""
+        """Return all numbers with all digits; an empty cell for a missing value."""
         return _csv(self.plain())
 
     @property
     def shown(self) -> list[Column]:
-        """Columns shown: those with a value, unless extra."""
+        """Columns with a value that are not extra."""
         shown = [column for column in self.columns if not column.is_extra]
         return [
             column
@@ -175,7 +177,11 @@ class Table:
     def rows(
         self, text: Callable[[str], str] = str, bold: str = "{}"
     ) -> list[list[str]]:
-        """Return a row of cells for each record shown, `bold` ones in that format; a repeated first cell is empty."""
+        """Return a row of cells for each shown record.
+
+        `text` escapes a cell, and `bold` is the format of bold cells. A repeated first
+        cell is empty.
+        """
         rows, shown = [], self.shown
         for record in filter(self.is_main, self.records):
             cells = [
@@ -190,7 +196,7 @@ class Table:
         return rows
 
     def to_markdown(self) -> str:
-        """Return the columns and records shown as a table of GitHub Markdown under a heading, the notes below."""
+        """Return the shown columns and records as a GitHub Markdown table, with heading and notes."""
         head = [_markdown(column.line) for column in self.shown]
         rule = [":---" if column.left else "---:" for column in self.shown]
         rows = [
@@ -210,7 +216,7 @@ class Table:
         )
 
     def to_latex(self) -> str:
-        """Return a table environment with the rules of package booktabs; notes as comments."""
+        """Return a LaTeX table environment with the rules of the package booktabs; notes become comments."""
         rows = [
             f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")
         ]
@@ -233,7 +239,7 @@ class Table:
         )
 
     def to_html(self) -> str:
-        """Return head and body of an HTML table of the columns and records shown."""
+        """Return head and body of an HTML table with the shown columns and records."""
         head = [
             html_cell("th", escape(printable_lines(column.heading)), column.left)
             for column in self.shown
@@ -251,7 +257,7 @@ class Table:
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        """Grids in the width: columns without room stand in further ones below, with the names of the rows."""
+        """Yield grids that fit the width; surplus columns continue in further grids below, with the row names."""
         yield Text(f"\n{printable(self.title)}")
         shown = self.shown
         rows = [
@@ -308,12 +314,12 @@ class Tables(Mapping[str, DataFrame]):
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
-    """JSON values beside the tables."""
+    """Additional JSON values."""
     verdict: tuple[str, ...] = ()
     """Sentences that summarise the tables."""
 
     def in_full(self) -> "Tables":
-        """Return the tables, all of them shown with all columns and records."""
+        """Return the tables, each with all columns and records shown."""
         return replace(
             self, tables={name: table.in_full() for name, table in self.tables.items()}
         )
@@ -352,19 +358,19 @@ class Tables(Mapping[str, DataFrame]):
         return f"<pre>{escape(printable_lines(repr(self)))}</pre>{''.join(tables)}"
 
     def to_markdown(self) -> str:
-        """Return verdict and tables, as far as they are shown."""
+        """Return the verdict and the shown tables."""
         verdict = "".join(f"- {_markdown(line)}\n" for line in self.verdict)
         return f"{verdict}\n" * bool(verdict) + "\n".join(
             table.to_markdown() for table in self._filled()
         )
 
     def to_latex(self) -> str:
-        """Return the tables, as far as they are shown, the verdict as comments."""
+        """Return the shown tables, with the verdict as comments."""
         verdict = "".join(f"% {printable(line)}\n" for line in self.verdict)
         return verdict + "\n".join(table.to_latex() for table in self._filled())
 
     def to_csv(self) -> str:
-        """Return all numbers, one in a row of five columns: table, run, part (sensor, lag), quantity, value."""
+        """Return each number in a row with five columns: table, run, part (sensor, lag), quantity, value."""
         rows = []
         for name, table in self.tables.items():
             for record in table.plain():
@@ -390,7 +396,7 @@ class Tables(Mapping[str, DataFrame]):
 
 
 def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
-    """Return the lines of sentences, each behind a dash, wrapped between words."""
+    """Yield the lines of `sentences`, each with a leading dash, wrapped between words."""
     for sentence in sentences:
         lines = textwrap.wrap(
             printable(sentence),
@@ -403,7 +409,10 @@ def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
 
 
 def html_cell(tag: str, content: str, is_left: bool) -> str:
-    """Return a cell of an HTML table with escaped `content`; of class `long` where it may be broken."""
+    """Return a cell of an HTML table with escaped `content`.
+
+    A cell with long content gets the class `long`, so that its lines may be broken.
+    """
     kind = " ".join(["left"] * is_left + ["long"] * (len(content) > _LONG))
     lines = content.replace("\n", "<br>")
     return (
@@ -421,7 +430,7 @@ def _csv(records: Sequence[Record]) -> str:
 
 
 def _markdown(text: str) -> str:
-    """Return `text` without anything that Markdown, or HTML in it, would interpret: cells, elements, links."""
+    """Return `text` with all characters escaped that Markdown or HTML would interpret."""
     return printable(text).translate(_MARKDOWN).replace("](", r"]\(")
 
 

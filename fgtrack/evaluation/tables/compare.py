@@ -1,4 +1,4 @@
-"""Runs in comparison: their tables and the sentences that summarise them."""
+"""Comparison of runs: tables, and the sentences that summarise them."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -41,25 +41,29 @@ _QUANTITIES = {
 }
 _CONTINUITY = ("tracked_share", "tracked_share_in_view", "breaks", "id_switches")
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
-_COMMON_SHARE = (
-    0.9  # of the samples that all runs have in common; below it a note counts them
-)
+# If the runs have less than this share of their samples in common, a note gives the numbers.
+_COMMON_SHARE = 0.9
 
 
 def compare(
     *runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: bool = False
 ) -> Tables:
-    """Return the metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`,
-    `lag`, `consistency`, `dispositions`, and `residuals_SENSOR` of every sensor.
+    """Compare the metrics of `runs`: the `verdict`, and tables by name.
 
-    Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
-    folders; a mapping gives runs labels. `streaming` also evaluates what was published when it was ready. Raises
-    `CallError` if no run is given, one is given twice, or a path is not a run folder, `DataError` if one is damaged.
+    The tables are `differences`, `tracking`, `multi_object`, `lag`, `consistency`,
+    `dispositions`, and `residuals_SENSOR` of every sensor. Runs of the same recording
+    are compared sample by sample. A path is a run folder, or a folder of run folders.
+    The keys of a mapping are labels. `streaming` also evaluates published states at the
+    time when they were ready.
+
+    Raises `CallError` without runs, for a run that is given twice, or if a path is not
+    a run folder. Raises `DataError` for a damaged run.
     """
     every = evaluated(runs)
     if not every:
-        raise CallError("compare: no run is given, name at least one")
-    metrics, compared = {item.label: item.metrics for item in every}, comparisons(every)
+        raise CallError("compare: no run is given, give at least one")
+    metrics = {item.label: item.metrics for item in every}
+    compared = comparisons(every)
     tables = {
         "differences": _differences(compared),
         "tracking": _tracking(metrics),
@@ -79,7 +83,7 @@ def compare(
 
 
 def _differences(compared: Sequence[Comparison]) -> Table:
-    """A row for each recording, quantity and run: its value, and how much worse than the best it is."""
+    """Return a row for each recording, quantity and run: its value, and the difference to the best run."""
     records = [
         {
             "quantity": name,
@@ -116,7 +120,7 @@ def _differences(compared: Sequence[Comparison]) -> Table:
 
 
 def _tracking(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run: errors against truth, continuity, number of tracks, time."""
+    """Return a row for each run: errors against truth, continuity, number of tracks, time."""
     records = []
     for label, item in metrics.items():
         record: dict[str, Any] = {"run": label, "estimator": item.estimator}
@@ -154,9 +158,9 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         ),
     ]
     notes = [
-        "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent; tracked: of the ticks in view",
-        "breaks: resumed after a loss or with another track; switches: the latter",
-        f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
+        "errors: RMSE against truth; NEES: mean position NEES, 2 if consistent; tracked: share of the ticks in view",
+        "breaks: tracking resumed after a loss or with another track; switches: only with another track",
+        f"false: tracks with a true object in less than {FALSE_TRACK_SHARE:.0%} of their rows",
     ]
     return Table(
         "Tracking",
@@ -167,7 +171,7 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
 
 
 def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
+    """Return a row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
     records = []
     for label, item in metrics.items():
         if item.multi_object is not None and item.truth is not None:
@@ -220,15 +224,18 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
         *(Column(text, key, is_extra=True) for key, text in others.items()),
     ]
     notes = [
-        "GOSPA: root mean square over ticks; the squares of its parts add up to its own; scores: 100 is perfect",
-        "unseen: missed where no sensor could see; the scores in % count it too",
+        "GOSPA: root mean square over ticks; its square is the sum of the squares of its parts; scores: 100 is perfect",
+        "unseen: missed objects that no sensor could detect; the scores in % count them too",
         "confirm: from an object's first detection to its first confirmed track",
     ]
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
 
 
 def _lag(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
+    """Return a row for each run and lag: errors, and their reduction by waiting.
+
+    Empty if no run has lagged or final states.
+    """
     records = []
     for label, item in (
         metrics.items()
@@ -274,8 +281,8 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         Column("NEES\npos.", "position_nees"),
     ]
     notes = [
-        "lag 0: states as published; window: final states, as they leave the window; NEES: 2 if consistent",
-        "below: reduction against the present states of the same tracks and stamps",
+        "lag 0: present states; window: final states, when they leave the window; NEES: 2 if consistent",
+        "below: reduction compared with the present states of the same tracks and stamps",
     ]
     return Table(
         "Error against lag (RMSE against truth)",
@@ -287,7 +294,7 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
 
 
 def _consistency(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run and normalised square: NEES of the present states, NIS and whiteness of every sensor."""
+    """Return a row for each run and normalised square: NEES of the present states, NIS and whiteness by sensor."""
     records = []
     for label, item in metrics.items():
         of = item.consistency
@@ -325,15 +332,15 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
         Column("correlation\nat lag 1", "lag1_correlation lag1_band", "{} ± {}"),
     ]
     notes = [
-        "band: of the mean of independent samples; errors along a run are not, so a single NEES may leave it",
-        f"correlation: of innovations, tracks with {FEWEST}+ of them; ± 95 % band if white",
+        "band: for the mean of independent samples; errors along a run are correlated, so a single NEES may leave it",
+        f"correlation: of the innovations of tracks with at least {FEWEST}; ± 95 % band for white innovations",
     ]
     title = "Consistency (mean NEES and NIS, and their expected values)"
     return Table(title, records, columns, ("run", "of"), notes, is_detail=True)
 
 
 def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run with the sensor: mean and standard deviation of the innovations, NIS, delay."""
+    """Return a row for each run with the sensor: mean and standard deviation of the innovations, NIS, delay."""
     records = []
     for label, item in metrics.items():
         if sensor in item.sensors:
@@ -368,7 +375,7 @@ def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
 
 
 def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run and sensor: dispositions of the detections, and their sum."""
+    """Return a row for each run and sensor: number of detections by disposition, and their sum."""
     records = []
     for label, item in metrics.items():
         for name, sensor in item.sensors.items():
@@ -401,9 +408,9 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
         Column("sum", "detections"),
     ]
     notes = [
-        "fused: also those that started a track",
-        "late: of the fused ones, those older than the newest of their track",
-        "overtaken: received after a newer one of the sensor, whatever its track",
+        "fused: includes detections that started a track",
+        "late: fused detections that are older than the newest detection of their track",
+        "overtaken: received after a newer detection of the sensor, of any track",
     ]
     notes += dict.fromkeys(line for item in metrics.values() for line in item.left_out)
     title = "Dispositions (the outcome of every detection)"

@@ -1,4 +1,4 @@
-"""The table of a sweep over its seeds: means at every point of the grid, and paired differences of the estimators."""
+"""Tables of a sweep over its seeds: means at every grid point, and paired differences of the estimators."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
 
 SWEEP_FILE = "sweep.csv"
-#: Metrics that have a better and a worse, in order of preference; the first is shown.
+#: Better direction of each metric, in order of preference; tables show the first metric.
 _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "truth.overall.errors.*.rmse": "less",
     "multi_object.gospa.in_view_rms_m": "less",
@@ -43,7 +43,7 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "multi_object.hota.hota": "more",
     "predictions.*.mean": "less",
 }
-#: Metrics that a summary shows first, and their headings.
+#: Headings of the metrics that a summary shows first.
 _MAIN: Mapping[str, str] = {
     "truth.overall.errors.position_m.rmse": "pos.\n[m]",
     "consistency.position_nees.mean": "NEES\npos.",
@@ -57,28 +57,31 @@ class SweepTable:
     """The rows of sweep.csv."""
 
     axes: tuple[str, ...]
-    """Columns that make a point of the grid."""
+    """Columns that define a grid point."""
     metrics: tuple[str, ...]
     rows: DataFrame
-    """Axes, `seed` and `estimator` as text, metrics as numbers; NaN where a cell is empty or not finite."""
+    """Axes, `seed` and `estimator` as text, and metrics as numbers; NaN for an empty or infinite cell."""
 
     @property
     def shown_axes(self) -> list[str]:
-        """Axes that vary and distinguish the points, without those of whole mappings where labels do it."""
+        """Axes that vary and distinguish the points; axes with whole mappings only if needed."""
         return distinguishing(
             self.rows[[axis for axis in self.axes if self.rows[axis].nunique() > 1]]
         )
 
     def means(self, metric: str) -> DataFrame:
-        """Return the mean over the seeds at every point and of every estimator; `CallError` if there is no such metric.
-        Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN of one seed) and `seeds` with a value.
+        """Return the mean over the seeds at every grid point, for every estimator.
+
+        Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN for a
+        single seed), and `seeds`, the number of seeds with a value. Raises `CallError`
+        for an unknown metric.
         """
         if metric not in self.metrics:
             hint = (
                 did_you_mean(metric, self.metrics)
-                or f", there are {', '.join(self.metrics[:5])} ..."
+                or f", use {', '.join(self.metrics[:5])} ..."
             )
-            raise CallError(f"{metric}: the sweep has no such metric{hint}")
+            raise CallError(f"{metric}: not a metric of the sweep{hint}")
         groups = self.rows.dropna(subset=[metric]).groupby(
             [*self.shown_axes, "estimator"], sort=False
         )[metric]
@@ -89,19 +92,22 @@ class SweepTable:
 
 @dataclass(frozen=True)
 class SeedComparison:
-    """The estimators in one metric at one point of the grid."""
+    """Comparison of the estimators in one metric at one grid point."""
 
     point: tuple[str, ...]
     """Cells of the axes."""
     metric: str
     seeds: int
-    """Seeds that all estimators have a value of."""
+    """Number of seeds with a value for all estimators."""
     entries: tuple[Entry, ...]
-    """From the best estimator to the worst; the values are means over the seeds."""
+    """Estimators, best first; the values are means over the seeds."""
 
 
 def read_sweep(folder: Path | str) -> SweepTable:
-    """The table of the sweep in `folder`; `CallError` without one, `DataError` if it is not that of a sweep."""
+    """Return the table of the sweep in `folder`.
+
+    Raises `CallError` if there is none, and `DataError` for an invalid table.
+    """
     path = Path(folder) / SWEEP_FILE
     try:
         with open_text(path) as file:
@@ -112,19 +118,17 @@ def read_sweep(folder: Path | str) -> SweepTable:
         ) from error
     except ValueError as error:
         raise DataError(
-            f"{path}: is not a table ({' '.join(str(error).split())}), repeat the sweep"
+            f"{path}: not a table ({' '.join(str(error).split())}), repeat the sweep"
         ) from error
     if (
         not {"seed", "estimator"} <= set(rows)
         or rows.empty
         or rows.isna().any(axis=None)
     ):
-        raise DataError(f"{path}: holds no rows of a sweep, repeat it")
+        raise DataError(f"{path}: no rows of a sweep, repeat the sweep")
     seed = rows.columns.get_loc("seed")
-    cells, values = (
-        rows.iloc[:, : seed + 2],
-        rows.iloc[:, seed + 2 :].apply(pd.to_numeric, errors="coerce"),
-    )
+    cells = rows.iloc[:, : seed + 2]
+    values = rows.iloc[:, seed + 2 :].apply(pd.to_numeric, errors="coerce")
     numbers = values.astype(float).replace([np.inf, -np.inf], np.nan)
     return SweepTable(
         tuple(rows.columns[:seed]), tuple(numbers), pd.concat([cells, numbers], axis=1)
@@ -132,7 +136,7 @@ def read_sweep(folder: Path | str) -> SweepTable:
 
 
 def distinguishing(points: DataFrame) -> list[str]:
-    """Columns that distinguish `points`, without those of whole mappings where labels do it."""
+    """Return the columns that distinguish `points`; columns with whole mappings only if needed."""
     distinct = points.drop_duplicates()
     plain = [
         axis for axis in points if not distinct[axis].str.startswith(("{", "[")).any()
@@ -141,8 +145,9 @@ def distinguishing(points: DataFrame) -> list[str]:
 
 
 def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
-    """Return a comparison for every metric with a better and a worse, and every point with several estimators."""
-    rows, result = sweep.rows, []
+    """Return a comparison for every metric with a better direction, at every point with several estimators."""
+    rows = sweep.rows
+    result = []
     cells = [tuple(row) for row in rows[list(sweep.axes)].to_numpy()]
     points = {point: k for k, point in enumerate(dict.fromkeys(cells))}
     (estimator, names), (seed, seeds) = (
@@ -158,11 +163,11 @@ def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
         values, costs = np.full((2, len(points), len(names), len(seeds)), np.nan)
         values[at], costs[at] = rows[metric], _cost(rows, metric)
         for point, value, cost in zip(points, values, costs, strict=True):
-            some = np.isfinite(cost).any(axis=1)
-            common = np.isfinite(cost[some]).all(axis=0)
-            if some.sum() > 1 and common.any():
+            valued = np.isfinite(cost).any(axis=1)
+            common = np.isfinite(cost[valued]).all(axis=0)
+            if valued.sum() > 1 and common.any():
                 entries = _ranked(
-                    names[some], value[some][:, common], cost[some][:, common]
+                    names[valued], value[valued][:, common], cost[valued][:, common]
                 )
                 result.append(SeedComparison(point, metric, int(common.sum()), entries))
     return result
@@ -181,7 +186,7 @@ def _ranked(
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
-    """Return a row for every comparison and estimator; shown are those of the first metric over several seeds."""
+    """Return a row for every comparison and estimator; those of the first metric over several seeds are shown."""
     records = [
         {
             **dict(zip(axes, item.point, strict=True)),
@@ -198,7 +203,8 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
         for item in compared
         for entry in item.entries
     ]
-    first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
+    first = compared[0].metric if compared else ""
+    keys = (*axes, "metric", "estimator")
     points = pd.DataFrame([item.point for item in compared], columns=list(axes))
     columns = [
         _point_column(points),
@@ -223,10 +229,8 @@ def summary_table(sweep: SweepTable) -> Table:
     main = [name for name in _MAIN if name in metrics] or metrics[: len(_MAIN)]
     metrics = list(dict.fromkeys((*main, *metrics)))
     groups = sweep.rows.groupby([*sweep.axes, "estimator"], sort=False)[metrics]
-    errors, seeds = (
-        groups.sem().add_suffix(".standard_error"),
-        groups.count().max(axis=1).rename("seeds"),
-    )
+    errors = groups.sem().add_suffix(".standard_error")
+    seeds = groups.count().max(axis=1).rename("seeds")
     names = [
         name for metric in metrics for name in (metric, f"{metric}.standard_error")
     ]
@@ -242,10 +246,8 @@ def summary_table(sweep: SweepTable) -> Table:
     ]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
-        both, scale = (
-            (name, f"{name}.standard_error"),
-            PERCENT if name.endswith("share_in_view") else 1.0,
-        )
+        both = (name, f"{name}.standard_error")
+        scale = PERCENT if name.endswith("share_in_view") else 1.0
         columns.append(
             Column(heading, both, "{} ± {}", scale, is_extra=name not in main)
         )
@@ -260,14 +262,14 @@ def summary_table(sweep: SweepTable) -> Table:
 
 
 def _point_column(points: DataFrame) -> Column:
-    """The axes that distinguish `points`, under the last parts of their names."""
+    """Return a column with the axes that distinguish `points`; its heading is the last parts of their names."""
     shown = distinguishing(points)
     heading = ",\n".join(axis.rpartition(".")[2] for axis in shown) or "point"
     return Column(heading, shown, ", ".join(["{}"] * len(shown)) or "{}", left=True)
 
 
 def _cost(rows: DataFrame, metric: str) -> DataFrame:
-    """The number that should be small: the metric, its negative, or its distance from the expected value."""
+    """Return the number to minimise: the metric, its negative, or its distance from the expected value."""
     better = next(
         better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern)
     )

@@ -1,7 +1,8 @@
-"""Accuracy when each run pays for its time: published states against the truth at the moment when they were ready.
+"""Streaming accuracy: published states against the truth at the time when they were ready.
 
-Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023. Times of ticks
-are those of timing.csv, so nothing depends on the machine that compares.
+So each run pays for its computing time. Sources: Li, Wang, Ramanan: Towards streaming
+perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023. Times of ticks come
+from timing.csv, so the result does not depend on the machine that compares.
 """
 
 from collections.abc import Sequence
@@ -28,21 +29,20 @@ from fgtrack.evaluation.tables.verdict import who_is_best
 from fgtrack.evaluation.truth import true_states
 from fgtrack.runs import Node, Run, ready_times
 
-#: A state is evaluated at its own stamp, as everywhere else; as published, at the moment when it was ready; the same
-#: after its user has moved it to that moment.
+#: Ways to evaluate a state: at its own stamp; as published, when it was ready; predicted by its user to that time.
 ASKED, READY, PREDICTED = "asked", "ready", "predicted"
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
 
 
 def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
-    """Return distances to the truth of the paired rows by when they are evaluated, where there is truth when ready.
-    Predictions move the published position along the published yaw at the published speed, if there are both.
+    """Return the distances of the paired rows from the truth, by way of evaluation.
+
+    Only rows with truth when they were ready count. Predictions move the published
+    position along the published yaw with the published speed, if both exist.
     """
     rows = np.flatnonzero(matching.paired)
-    tracks, object_index = (
-        matching.tracks.where(matching.paired),
-        matching.object_index[rows],
-    )
+    tracks = matching.tracks.where(matching.paired)
+    object_index = matching.object_index[rows]
     ready_ns = _ready(run)[0][matching.tick_index[rows]]
     truth = true_states(run.tables["truth"], object_index, ready_ns)[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
@@ -63,8 +63,10 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
 def streaming_tables(
     runs: Sequence[EvaluatedRun],
 ) -> tuple[dict[str, Table], list[str]]:
-    """Return tables `streaming` and `load`, and sentences on the best of the `runs` with a load of at most 1."""
-    load, records, sentences = _load(runs), [], []
+    """Return the tables `streaming` and `load`, and sentences on the best runs with a load of at most 1."""
+    load = _load(runs)
+    records = []
+    sentences = []
     late = {
         record["run"]: record["load"] for record in load.records if record["load"] > 1.0
     }
@@ -87,10 +89,10 @@ def streaming_tables(
         }
         if len(group) > 1 and entries:
             sentences += [
-                who_is_best(entries[READY], "where each is evaluated when it is ready"),
+                who_is_best(entries[READY], "evaluated when the states are ready"),
                 who_is_best(
                     entries[PREDICTED],
-                    "where users also predict what they get to that moment",
+                    "evaluated when ready, with states predicted to that time by the user",
                 ),
             ]
         for when, of_runs in entries.items():
@@ -100,11 +102,11 @@ def streaming_tables(
             ]
     for label, share in late.items():
         sentences.append(
-            f"{label} falls behind for good (load {share:.0%}): not ranked, the longer the run, the worse."
+            f"{label} cannot keep up (load {share:.0%}): it is not ranked, as its delay grows with the run."
         )
     notes = [
-        "when ready: as published, against the truth when its computation was done",
-        "predicted: the same, moved straight on to then at its own speed by its user",
+        "when ready: the published state against the truth at the end of its computation",
+        "predicted: the published state, moved straight ahead at its speed to that time",
         STANDING_NOTE,
     ]
     evaluated = Column(
@@ -119,22 +121,22 @@ def streaming_tables(
 
 
 def _ready(run: Run) -> tuple[IntArray, Node]:
-    """Time at which the output of every tick was ready, shape (ticks,), and the node that did them."""
+    """Return the time at which the output of each tick was ready, shape (ticks,), and the node that ran them."""
     node_hz = (run.config.get("clock") or {}).get("node_hz")
     node = Node(None if node_hz is None else period_ns(float(node_hz)))
     return ready_times(run.tables["timing"], node), node
 
 
 def _load(runs: Sequence[EvaluatedRun]) -> Table:
-    """A row for each run: time from its tick until an output was ready, late ticks, load."""
+    """Return a table with a row for each run: time from tick to output, late ticks, load."""
     records = []
     for item in runs:
-        timing, (ready_ns, node) = item.run.tables["timing"], _ready(item.run)
-        now_ns, is_periodic = timing["now_ns"], node.period_ns is not None
-        delay, length_ns = (
-            Distribution.of((ready_ns - now_ns) / NS_PER_S),
-            np.ptp(now_ns) if len(now_ns) else 0,
-        )
+        timing = item.run.tables["timing"]
+        ready_ns, node = _ready(item.run)
+        now_ns = timing["now_ns"]
+        is_periodic = node.period_ns is not None
+        delay = Distribution.of((ready_ns - now_ns) / NS_PER_S)
+        length_ns = np.ptp(now_ns) if len(now_ns) else 0
         times = {
             "ready_after_p50_s": delay.p50,
             "ready_after_p99_s": delay.p99,
@@ -169,7 +171,7 @@ def _load(runs: Sequence[EvaluatedRun]) -> Table:
         Column("load\n[%]", "load", scale=PERCENT),
     ]
     notes = [
-        "of all ticks, one after the other: a tick begins when it is due, or when the one before is done",
-        "load: computing time over the length of the run; above 100 % it falls behind for good",
+        "ticks run one after another: a tick begins when it is due, or when the previous tick has ended",
+        "load: computing time over the length of the run; above 100 % the delay grows without bound",
     ]
     return Table("Load", records, columns, notes=notes)

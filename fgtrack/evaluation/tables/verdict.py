@@ -1,4 +1,4 @@
-"""Sentences of a comparison with their intervals: the best run, the fit of the noise, the worth of waiting."""
+"""Verdict of a comparison: sentences with intervals on the best run, the noise, and the benefit of waiting."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -15,11 +15,14 @@ _POSITION = "position_rmse_m"
 def verdict(
     metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
 ) -> tuple[str, ...]:
-    """Sentences on the runs of `metrics`, by label; none for runs without errors and innovations."""
+    """Return sentences on the runs of `metrics`, which are given by label.
+
+    Empty for runs without errors and innovations.
+    """
     sentences = [
         who_is_best(one.quantities[_POSITION], "at the newest stamp")
         if _POSITION in one.quantities
-        else f"{_listed(one.runs)} never track the same object at the same stamp: there is nothing to pair."
+        else f"{_listed(one.runs)} never track the same object at the same stamp, so they cannot be compared."
         for one in compared
     ]
     alone = [
@@ -29,8 +32,8 @@ def verdict(
         sentences.append(
             "Without truth there are no errors to compare."
             if all(one.truth is None for one in metrics.values())
-            else "Not all runs are of the same recording with truth (or they are evaluated by different settings): "
-            "only those that are can be ranked by their differences."
+            else "The runs differ in recording, truth or evaluation settings: only runs that share these three are "
+            "ranked by their differences."
         )
     best = [
         one.quantities[_POSITION][0].name
@@ -50,8 +53,8 @@ def verdict(
             lag.lag_s: lag.position_reduction for lag in (*lags[:1], *lags[1:][-1:])
         }
         parts = [
-            f"{lag_s:g} s by {PERCENT * of.mean:.0f} % ({PERCENT * of.low:.0f} to {PERCENT * of.high:.0f})"
-            for lag_s, of in shares.items()
+            f"{lag_s:g} s by {PERCENT * share.mean:.0f} % ({PERCENT * share.low:.0f} to {PERCENT * share.high:.0f})"
+            for lag_s, share in shares.items()
         ]
         if parts:
             sentences.append(
@@ -61,9 +64,10 @@ def verdict(
 
 
 def who_is_best(entries: Sequence[Entry], when: str) -> str:
-    """A sentence on a position RMSE: the best run `when`, and how much worse the others are.
+    """Return a sentence on the position RMSE `when`: the best run, and how much worse the other runs are.
 
-    A difference whose interval contains 0 is not resolved. Runs tie where they differ by rounding alone.
+    A difference is not resolved if its interval contains 0. Runs tie if they differ
+    only by rounding.
     """
     best, *others = entries
     near = [entry for entry in others if entry.standing == "tie"]
@@ -85,13 +89,13 @@ def who_is_best(entries: Sequence[Entry], when: str) -> str:
 
 
 def _is_rounding(entry: Entry, value: float) -> bool:
-    """True if the whole interval of the difference is rounding of a value."""
+    """True if the whole interval of the difference is rounding of `value`."""
     worse = entry.worse_by or UNKNOWN
     return max(abs(worse.low), abs(worse.high)) <= NEGLIGIBLE * value
 
 
 def _metres(entry: Entry, what: str = "") -> str:
-    """Amount by which `entry` is worse, with the interval and `what` behind the unit."""
+    """Return the amount by which `entry` is worse, with its interval; `what` follows the unit."""
     worse = entry.worse_by or UNKNOWN
     scale, unit = (1e3, "mm") if abs(worse.mean) < 0.01 else (1.0, "m")
     mean, low, high = (
@@ -99,7 +103,7 @@ def _metres(entry: Entry, what: str = "") -> str:
     )
     amount = f"{mean} {unit}{what}"
     if not worse.is_known:
-        return f"{amount}, too short a run for an interval"
+        return f"{amount}, the run is too short for an interval"
     return (
         f"{amount} ({low} to {high})"
         if what
@@ -108,16 +112,16 @@ def _metres(entry: Entry, what: str = "") -> str:
 
 
 def _noise(label: str, one: Metrics) -> Iterator[str]:
-    """Fit of the covariances of a run, the best one, to the errors: NEES of the position, NIS of every sensor."""
-    of = one.consistency
+    """Yield sentences on the consistency of a run's covariances: position NEES and NIS of every sensor."""
+    result = one.consistency
     squares = (
-        [("NEES of the position", of.position_nees, of.position_nees_interval)]
-        if of.position_nees.count
+        [("NEES of the position", result.position_nees, result.position_nees_interval)]
+        if result.position_nees.count
         else []
     )
     squares += [
         (f"NIS of {name}", nis, UNKNOWN)
-        for name, nis in of.nis.items()
+        for name, nis in result.nis.items()
         if nis.count >= FEWEST
     ]
     texts = {
@@ -150,12 +154,12 @@ def _noise(label: str, one: Metrics) -> Iterator[str]:
         )
         yield (
             f"The configured noise is {size} (judged by {label}): {', '.join(texts[name] for name in off)}. "
-            "`fgtrack advise --tune` fits it, or reports what has to be corrected first; the order of the runs may "
-            "change then."
+            "`fgtrack advise --tune` fits the noise, or reports the problem to solve first; this may change the order "
+            "of the runs."
         )
     elif far:
         names = ", ".join(texts[name] for name, *_ in far)
-        yield f"Run too short to assess the noise (judged by {label}): {names}."
+        yield f"The run is too short to assess the noise (judged by {label}): {names}."
     elif squares:
         yield f"The noise is consistent (judged by {label}): {', '.join(texts.values())}."
 
