@@ -320,7 +320,7 @@ def outputs(out: Path) -> list[Path]:
 
 
 def head_at(late: CloseUp | DataError) -> ReportHead:
-    """Return the head of a report that opens at a late detection, or gives the reason why there is none."""
+    """Return the head of a report that opens at a late detection, or gives the reason why it cannot."""
     if isinstance(late, DataError):
         return ReportHead(missing=(f"no close-up: {late}",))
     x_m, y_m = late.after.means[-1, :2].tolist()

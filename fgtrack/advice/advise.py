@@ -318,7 +318,7 @@ class Adviser:
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
     def _ego(self, seen: Mapping[str, Arrivals]) -> Iterator[Finding]:
-        """Yield gaps and low rates of the ego states, and an ego with a larger delay than the lists that need it.
+        """Yield gaps and low rates of the ego states, and an ego that arrives later than the lists in a moving frame.
 
         `seen` are the arrivals of the sensors.
         """

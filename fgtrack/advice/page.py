@@ -161,5 +161,5 @@ def _wrapped(texts: Sequence[str]) -> list[str]:
 
 
 def rounded_ms(value: Value) -> str:
-    """Return whole milliseconds; no value if the sensor's clock is unrelated to that of the recorder."""
+    """Return whole milliseconds; no value if the clocks of sensor and recorder are unrelated."""
     return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE

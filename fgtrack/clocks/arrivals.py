@@ -59,9 +59,9 @@ class Arrivals:
     counts: IntArray
     """Number of detections in each message, shape (n,)."""
     object_late: float | None = None
-    """Share of detections with an identity that arrived after a newer one of the same object.
+    """Share of detections with an identity that arrived after a newer detection of the same object.
 
-    None for fewer than two detections of each object.
+    None without two detections of one object.
     """
 
     @cached_property
@@ -179,7 +179,7 @@ def arrivals_of(messages: Iterable[Message]) -> dict[str, Arrivals]:
 def overtaken_shares(
     arrivals: Mapping[str, Arrivals], sensors: Sequence[str]
 ) -> dict[str, float]:
-    """Return for each of `sensors` the share of its lists that arrived after a newer list of any of them."""
+    """Return for each of `sensors` the share of its lists that arrived after a newer list of any sensor."""
     stamps_ns = np.concatenate([arrivals[name].stamps_ns for name in sensors])
     receipts_ns = np.concatenate([arrivals[name].receipts_ns for name in sensors])
     sensor_rows = np.repeat(
@@ -224,7 +224,7 @@ def _too_short(
 ) -> Iterator[Finding]:
     """Yield a window that is shorter than the delays or a period, and a track life shorter than a period.
 
-    `needed_s` is the delay within which the detections arrive. The period is that of
+    `needed_s` is the delay within which the detections arrive. The period belongs to
     the slowest sensor.
     """
     slowest = max(arrivals, key=lambda item: item.period_s, default=None)

@@ -1,7 +1,7 @@
 """Clock offsets of sensors, against the truth of a recording or against a reference sensor.
 
-Let p(t) be the path of an object in the map, T(t) = map_from_ego, and z a detection of
-the object with stamp s. At the offset d the residual is
+Let p(t) be the path of an object in the map, and T(t) = map_from_ego. A detection z of
+the object has the stamp s. At the offset d the residual is
 
     r(d) = p(s - d) - T(s - d) z = r(0) + d r'(0) + ...
 
@@ -9,16 +9,16 @@ r' is the negative velocity of the object relative to the ego frame. Gauss-Newto
 Huber weights estimates d. The path is the truth, or a smoothing spline through the
 detections of the reference sensor.
 
-With truth, a constant bias is estimated too. Its axes are along and across the motion
-of the object, or those of the ego; the axes with the smaller residuals are used. Where
+With truth, a constant bias is estimated too. Its axes are along and across the motion,
+either of the object or of the ego. The axes with the smaller residuals are used. Where
 the velocity hardly changes, bias and offset cannot be separated, and the offset stays
 unknown.
 
 The standard deviation of d is a jackknife over stretches of time. So it includes
 time-correlated errors (Bell and McCaffrey, Survey Methodology 28, 2002). The ratio of d
-to it follows Student's t distribution. Its degrees of freedom are the effective number
-of stretches minus 1, where larger stretches count more (Carter, Schnepel and
-Steigerwald, Review of Economics and Statistics 99, 2017).
+to its standard deviation follows Student's t distribution. Its degrees of freedom are
+the effective number of stretches minus 1. Stretches of unequal information count as
+fewer (Carter, Schnepel and Steigerwald, Review of Economics and Statistics 99, 2017).
 """
 
 import itertools
@@ -186,8 +186,8 @@ class OffsetReport:
     def surely_late_s(self, one: SensorOffset) -> float | None:
         """Return the time by which the later of two clocks is late at least.
 
-        It is negative if the later clock is that of the reference. None if either clock
-        may be wrong.
+        It is negative if the reference has the later clock. None if either clock may be
+        wrong.
         """
         if not one.is_off or one.offset_s is None or one.half_s is None:
             return None

@@ -99,7 +99,7 @@ def _change(one: Arrivals) -> Iterator[Finding]:
 
 
 def clock_text(one: SensorOffset, report: OffsetReport) -> str:
-    """Return a sentence on the clock of a sensor: its offset, the bounds, and what is missing to identify it."""
+    """Return a sentence on the clock of a sensor: its offset, its bounds, and the data needed to identify it."""
     reference = (
         "the truth of the recording"
         if report.reference == TRUTH

@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
     in_time: FloatArray
     """Bound if every measurement arrived at its stamp."""
     arrived: FloatArray
-    """Bound from the measurements that have arrived, each used at its own stamp."""
+    """Bound from the measurements that have arrived, each used at its stamp."""
     dropped: FloatArray
     """Bound from the arrived measurements without those that arrived after a newer measurement."""
 
@@ -150,7 +150,7 @@ def bounds_along(
 ) -> Bounds:
     """Return the mean over trajectories of the bounds along each single trajectory.
 
-    The parameters and errors are those of `bounds`. Along a trajectory the bound is the
+    The parameters and errors are as in `bounds`. Along a trajectory the bound is the
     covariance of a filter that is linearised at the true states. The mean is closer to
     an achievable error, but no lower bound.
     """

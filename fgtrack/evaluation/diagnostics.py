@@ -33,7 +33,7 @@ _FEWEST_BREAKS = 3
 _BREAKS_SHARE = 0.25
 # Share of the used detections that start a track which is never confirmed. Clutter alone stays below it.
 _DEAD_SHARE = 0.5
-# A track continues another one if it begins at most this time after, or before, the other one ends.
+# A track continues an earlier track if it begins at most this time after, or before, the earlier track ends.
 _GAP_S = 5.0
 _OVERLAP_S = 2.0
 # Largest distance from the predicted position: noise, and a share of the predicted way for turns and changes of speed.

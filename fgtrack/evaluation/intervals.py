@@ -155,8 +155,8 @@ def correlation_length(values: FloatArray) -> float:
 
     The correlations are weighted by the flat-top window of Politis and White 2004
     (Econometric Reviews 23). The window is twice as wide as the first lag after which
-    five successive correlations are insignificant. The result is n if there is no such
-    lag below n / 4.
+    five successive correlations are insignificant. The result is n if this lag is not
+    below n / 4.
     """
     n = len(values)
     centred = values - values.mean()

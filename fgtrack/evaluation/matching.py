@@ -95,10 +95,10 @@ ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` with its true objects at every tick; None without truth.
 
-    The method is that of CLEAR (Bernardin and Stiefelhagen 2008). A pair of the
-    previous tick stays while it is inside the gate. The Hungarian method assigns the
-    rest: first as many pairs as possible, then the least sum of distances. Tracks of
-    ignored objects, and in ignored regions, are excluded.
+    The method is CLEAR (Bernardin and Stiefelhagen 2008). A pair of the previous tick
+    stays while it is inside the gate. The Hungarian method assigns the rest: first as
+    many pairs as possible, then the least sum of distances. Tracks of ignored objects,
+    and in ignored regions, are excluded.
     """
     options = options or evaluation_settings(run)
     paths = true_paths(run.tables["truth"])
@@ -275,7 +275,7 @@ def published_rows(tracks: Columns, ticks: IntArray, track_ids: IntArray) -> Int
 def neighbours(
     tracks: Columns, name: str, values: IntArray, track_ids: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Rows of each track before and after a value: two arrays of shape (n,); -1 without such a row.
+    """Rows of each track before and after a value: two arrays of shape (n,); -1 for a missing row.
 
     The first is the last row whose column `name` is at most `values`. The second is the
     first row whose column is at least `values`.
@@ -308,8 +308,8 @@ def _ignored(
 ) -> BoolArray:
     """Mask of the rows of `tracks` that KITTI's rules ignore, shape (rows,).
 
-    These are the rows paired with an ignored object. Rows without any object in an
-    ignored region count as well.
+    These are rows paired with an ignored object, and rows without any object in an
+    ignored region.
     """
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
     unknown = dict.fromkeys(

@@ -50,7 +50,7 @@ class ObjectMetrics:
     ticks_present: int = 0
     """Number of ticks with truth."""
     ticks_tracked: int = 0
-    """Number of these ticks with a paired track."""
+    """Number of ticks with truth and a paired track."""
     breaks: int = 0
     """Number of times that tracking resumed after a loss or with another track."""
     id_switches: int = 0
@@ -173,7 +173,7 @@ def evaluate(
     """Return the metrics of `run`; without truth only those that require none.
 
     `truth` are columns of truth.csv, for instance a DataFrame; by default the truth of
-    the recording. `options` are by default those of the run.
+    the recording. `options` are by default the settings in the run's configuration.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])

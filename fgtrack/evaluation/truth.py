@@ -30,7 +30,7 @@ class TruePath:
     """x, y, yaw, speed and yaw rate at the stamps, shape (n, 5); NaN where the truth has no value."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
-        """Return the states at `stamps_ns` (m,), shape (m, 5); NaN where there is no truth.
+        """Return the states at `stamps_ns` (m,), shape (m, 5); NaN without truth.
 
         The position is a cubic Hermite curve if both neighbours have yaw and speed,
         else linear. All other entries are linear. There is no truth before the first

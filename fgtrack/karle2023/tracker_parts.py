@@ -269,7 +269,7 @@ class PublishedLifecycle(CountingLifecycle):
     - The counter may exceed its cap.
     - A birth has the time of the tick, and a match has the stamp of the sensor.
 
-    The range is that of the state one batch earlier; see `PublishedTracker`.
+    The range belongs to the state one batch earlier; see `PublishedTracker`.
     """
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
@@ -312,9 +312,10 @@ class PublishedLifecycle(CountingLifecycle):
 class PublishedTracker(Tracker):
     """Tracker with the processing order of the published implementation (defects Q9 and Q22).
 
-    A list older than the storage still starts tracks. An empty list ages every track.
-    The range that ages a track is measured from the present ego to the track's position
-    after the previous batch, or at the end of the previous tick.
+    A list older than the storage still starts tracks. An empty list ages every track. A
+    track ages by its range: the distance from the present ego to an earlier position of
+    the track. That position was known after the previous batch, or at the end of the
+    previous tick.
     """
 
     def __init__(self, parts: TrackerParts) -> None:

@@ -19,7 +19,7 @@ from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gr
 from fgtrack.core.linalg import congruence, kernels, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray
 
-#: Every state begins with the entries of `POLAR` or with those of `CARTESIAN`.
+#: Every state begins with the entries of `POLAR` or of `CARTESIAN`.
 POLAR = STATE_NAMES[:4]
 CARTESIAN = ("x_m", "y_m", "vx_mps", "vy_mps")
 #: The derivative of the heading by the velocity grows as 1 / speed. Below this speed it is held constant.
@@ -179,10 +179,10 @@ class MotionModel(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the state and covariance P of this model from a kinematic state and its covariance.
 
-        An entry that the kinematic state lacks is 0 with variance `start_variance`. For
-        a Cartesian state, P also contains the variance of the product of speed error
-        and yaw error, across the heading. Without it, an object born at speed 0 could
-        not move sideways.
+        An entry that the kinematic state lacks is 0 with variance `start_variance`. A
+        Cartesian state has an additional variance across the heading: the variance of
+        the product of speed error and yaw error. Without it, an object born at speed 0
+        could not move sideways.
         """
         n = self.dim
         if self._is_kinematic and n <= mean.shape[-1]:

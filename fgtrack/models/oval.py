@@ -22,8 +22,8 @@ def make_oval() -> TrackMap:
     """Return a banked tri-oval of 2.4 km, 15 m wide, driven counter-clockwise.
 
     The turns have a radius of 220 m. The curvature has a continuous derivative. The lap
-    closes exactly, because it is symmetric about the line through the start and the
-    middle of the back straight.
+    is symmetric about the line through the start and the middle of the back straight.
+    So it closes exactly.
     """
     points = _centre_line()
     path = Path.through(points)

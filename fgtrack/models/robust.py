@@ -8,9 +8,9 @@ variable with k degrees of freedom exceeds it with the same probability. So a lo
 treats the same share of good measurements as outliers, however many components they
 have.
 
-The names and forms are those of GTSAM. Weights are 1 at d = 0 and never increase with
-d. So each reweighting lowers the sum of prior cost and loss (Huber and Ronchetti,
-Robust Statistics, 2009, section 7.8).
+Names and forms follow GTSAM. Weights are 1 at d = 0 and never increase with d. So each
+reweighting lowers the sum of prior cost and loss (Huber and Ronchetti, Robust
+Statistics, 2009, section 7.8).
 """
 
 import math

@@ -79,11 +79,11 @@ class Correlation:
     time_s: PositiveFloat = 1.0
     """Correlation time: the autocorrelation of the correlated part falls to 1/e after it."""
     jump_probability: float = Field(0.0, ge=0.0, lt=1.0)
-    """Probability that the whole position error is new, for instance because the sensor
-    now sees the other end of a hull.
+    """Probability that the whole position error is new.
 
-    A detection that a claim refuses then updates a confirmed track without a detection
-    of its own, if a jump is more likely than clutter. See `association.claim_m`.
+    For instance, the sensor now detects the other end of a hull. Then a detection that
+    a claim refuses still updates a confirmed track without another detection, if a jump
+    is more likely than clutter. See `association.claim_m`.
     """
 
 
@@ -114,8 +114,8 @@ class SensorModel:
     curvature_from_map_std_radpm: PositiveFloat | None = None
     """Use the curvature of the map's line as a measurement of yaw rate over speed.
 
-    This is its standard deviation: it covers drivers who leave the line. null: no such
-    measurement.
+    This is its standard deviation: it covers drivers who leave the line. null: the
+    curvature is not used.
     """
     std_growth: Mapping[str, NonNegativeFloat] = field(default_factory=dict)
     """Growth of the standard deviation of a component per metre of range: the variance is
@@ -132,10 +132,11 @@ class SensorModel:
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
     """Range at which a track that this sensor misses loses one count."""
     stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
-    """Stamp of a detection: of the message, of the object where it has one, or the mean of the objects' stamps.
+    """Stamp of a detection.
 
-    `receipt` uses the receipt time, for a driver that sets no stamps or uses another
-    clock.
+    `message`: the stamp of its list. `object`: its own stamp, if it has one.
+    `objects_mean`: the mean of the stamps in the list. `receipt`: the receipt time, for
+    a driver that sets no stamps or uses another clock.
     """
     clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
     """Stamp minus time of measurement.
@@ -182,9 +183,9 @@ class SensorModel:
     field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] | None = None
     """Full opening angle of the field of view, centred on the sensor axis.
 
-    It affects existence and evaluation alone. null: all around; a replay without any
-    given range uses the field of view of the recording, if the sensor detects objects
-    in it.
+    It affects existence and evaluation alone. null: all around. A replay without any
+    given range takes it from the recording: from its header, or from the sector of the
+    detections.
     """
     scan: bool = True
     """True if a list contains all objects in view, so a missing object is a miss.
@@ -262,7 +263,7 @@ class SensorModel:
 
     @property
     def mount_or_origin(self) -> Mount:
-        """The configured mount; the origin if there is none."""
+        """The configured mount; the origin without a mount."""
         return self.mount or _AT_ORIGIN
 
     @property

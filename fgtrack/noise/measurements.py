@@ -49,7 +49,7 @@ class BankCall:
     stamp_ns: int
     track_ids: Sequence[int]
     observations: Sequence[Observation] = ()
-    """Fused observations of these tracks; empty for a birth."""
+    """Fused observation of each track; empty for a birth."""
     start: Start | None = None
     """First state of a new track; None for measurements."""
 
@@ -78,7 +78,7 @@ def recorded_bank(
 ) -> tuple["RecordingBank", Run]:
     """Replay the messages; return the bank with its recorded calls, and the run.
 
-    The arguments are those of `recorded_series`.
+    The arguments are as in `recorded_series`.
     """
     recorder = MeasurementRecorder(config, gate_stds)
     run = replay_in_memory(messages, config, origin=origin, observed=recorder)
@@ -118,7 +118,7 @@ class MeasurementRecorder:
 class _WideGate:
     """Association whose gate is widened to `stds` standard deviations of each detection.
 
-    The gate probability of a Mahalanobis gate is raised as well.
+    The probability of a Mahalanobis gate is raised too.
     """
 
     association: GatedEuclidean | GatedMahalanobis
@@ -153,8 +153,8 @@ class _WideGate:
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Return the largest position standard deviation for each track position in `means`.
 
-        For a detection with a bearing alone it is the one across the line of sight, at
-        the distance of the track.
+        A bearing alone has a standard deviation across the line of sight, which grows
+        with the distance of the track.
         """
         if candidate.position_covariance is not None:
             return np.full(

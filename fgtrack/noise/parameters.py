@@ -224,7 +224,7 @@ class TuneReport:
     count: int
     """Number of innovations that contributed to the final fit."""
     num_tracks: int
-    """Number of tracks of these innovations."""
+    """Number of tracks in the final fit."""
     num_mixed: int
     """Number of measurements excluded because most of their neighbours are outliers, see `with_mixed_marked`."""
     rounds: int

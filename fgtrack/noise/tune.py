@@ -325,9 +325,9 @@ class _Tuning:
     ) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum with identifiable parameters only, the likelihood, and a report by parameter.
 
-        A parameter that is not identifiable keeps its configured value, or gets the
-        nearest value that the data do not reject. The other parameters are not
-        refitted, as they would compensate for it.
+        A parameter that is not identifiable keeps its configured value. If the data
+        reject this value, the parameter gets the nearest value that they do not reject.
+        The other parameters are not refitted, as they would compensate for it.
         """
         count = len(start)
         known: list[Known] = ["no"] * count

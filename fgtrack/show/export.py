@@ -34,8 +34,8 @@ def export(
     runs begin with the name of the run. Returns the number of messages by topic, and a
     line for each content that cannot be shown.
 
-    Raises `CallError` for runs of different recordings, without the package
-    `foxglove-sdk`, or if `out` is an invalid name, exists, or lies in a run. Raises
+    Raises `CallError` for runs of different recordings, and without the package
+    `foxglove-sdk`. Also if `out` is an invalid name, exists, or lies in a run. Raises
     `DataError` if a run or its map is damaged, or a time does not fit into the file.
     """
     if not ros2:

@@ -11,7 +11,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import published_rows
 from fgtrack.runs import Columns, Run
 
-#: Length, width and height of an object of unknown size: those of a racing car.
+#: Length, width and height of a racing car, used for an object of unknown size.
 NOMINAL_SIZE_M = (4.8, 2.0, 1.2)
 #: Radius in standard deviations that contains 95 % of a Gaussian in the plane.
 AROUND_95 = math.sqrt(float(chdtri(2, 0.05)))

@@ -51,7 +51,7 @@ def test_it_is_one_detection_that_came_late_and_the_rule_says_how_typical_it_is(
         assert updates["disposition"][
             row & (updates["sensor"] == arrival.sensor)
         ].tolist() == ["out_of_sequence"]
-    rule = r"\d+ % of \d+ late detections lower the error of the present.* (\d+\.\d+) to (\d+\.\d+) m"
+    rule = r"\d+ % of \d+ late detections lower the present error.* (\d+\.\d+) to (\d+\.\d+) m"
     errors_m = re.match(rule, found[0].rule)
     assert errors_m is not None
     assert float(errors_m[1]) > float(errors_m[2])
@@ -96,7 +96,7 @@ def test_what_is_not_there_is_said(folder: Path) -> None:
         "tuned",
         estimator="ekf-replay",
     )
-    with pytest.raises(fgtrack.DataError, match="recording of the run is not there"):
+    with pytest.raises(fgtrack.DataError, match="recording of the run is missing"):
         fgtrack.close_ups([in_memory])
 
 
@@ -147,6 +147,6 @@ def test_the_command_refuses_times_that_are_not_and_goes_on_without_a_recording(
             command(["figure", runs[0], "-o", str(tmp_path / "none"), "--stamp", "4"])
             == 1
         )
-        assert "recording of the run is not there" in capsys.readouterr().err
+        assert "recording of the run is missing" in capsys.readouterr().err
     finally:
         (tmp_path / "drive.jsonl").rename(folder / "drive.jsonl")

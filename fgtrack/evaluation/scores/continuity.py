@@ -33,7 +33,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     It begins at the stamp of the first detection that a track fuses near the object.
     The track must then be within `gate_m` of the object, which is its nearest object.
     It ends at the first tick at which the object is paired with a confirmed track. NaN
-    if there is none.
+    without a confirmed track.
     """
     import pandas as pd
 

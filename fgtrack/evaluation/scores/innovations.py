@@ -106,8 +106,8 @@ def message_delays(updates: Columns) -> tuple[IntArray, FloatArray]:
 def autocorrelation(updates: Columns) -> Autocorrelation | None:
     """Return the autocorrelation of the innovations in `updates` of one sensor.
 
-    None if no track has enough innovations. The position innovations are used, or those
-    of the first component for a sensor without positions.
+    None if no track has enough innovations. Position innovations are used. A sensor
+    without positions uses its first component.
 
     The innovations nu of a track are taken in the order of processing. Their normalised
     autocorrelation at lag 1 is

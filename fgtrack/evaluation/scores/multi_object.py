@@ -48,7 +48,7 @@ class MultiObjectMetrics:
     hota: Mapping[str, float]
     """Means of `deta`, `assa` and `hota` over the similarity thresholds 0.05, 0.1, ..., 0.95."""
     others: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Values of the registered metrics by name of the metric: `ospa`, and those of plug-ins."""
+    """Values of the registered metrics by name of the metric, for instance `ospa`; plug-ins included."""
 
 
 def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:

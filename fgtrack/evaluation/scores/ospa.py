@@ -1,7 +1,8 @@
 """OSPA, the optimal sub-pattern assignment distance of order 2.
 
-Schuhmacher, Vo and Vo, A consistent metric for performance evaluation of multi-object filters, IEEE Transactions on
-Signal Processing 56(8), 2008, equation 3, with p = 2.
+Source: Schuhmacher, Vo and Vo, "A consistent metric for performance evaluation of
+multi-object filters", IEEE Transactions on Signal Processing 56(8), 2008, equation 3,
+with p = 2.
 """
 
 import numpy as np
@@ -10,10 +11,14 @@ from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
 
 
 def ospa(scenes: Scenes, c_m: float) -> dict[str, float]:
-    """Mean `mean_m` and root mean square `rms_m` over the ticks of the OSPA distance with the cut-off `c_m`.
+    """Return the mean `mean_m` and the root mean square `rms_m` of the OSPA distance over the ticks.
 
-    With m the larger number of tracks and objects, and the best assignment of the smaller set,
-    OSPA^2 = (sum of min(distance, c)^2 + c^2 for each element left over) / m. It is 0 where both sets are empty.
+    `c_m` is the cut-off distance. m is the larger number of tracks and objects. The
+    smaller set is assigned to the larger set in the best way:
+
+        OSPA^2 = (sum of min(distance, c)^2 over the pairs + c^2 for each unassigned element) / m
+
+    OSPA is 0 if both sets are empty.
     """
     num_ticks = len(scenes.present)
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
@@ -29,7 +34,7 @@ def ospa(scenes: Scenes, c_m: float) -> dict[str, float]:
     squares_m2 = np.where(larger > 0, c_m**2 - gain_m2 / np.maximum(larger, 1), 0.0)
     if not num_ticks:
         return {"mean_m": np.nan, "rms_m": np.nan}
-    squares_m2 = np.maximum(squares_m2, 0.0)  # of rounding
+    squares_m2 = np.maximum(squares_m2, 0.0)  # rounding may make a square negative
     return {
         "mean_m": float(np.sqrt(squares_m2).mean()),
         "rms_m": float(np.sqrt(squares_m2.mean())),

@@ -106,7 +106,7 @@ class SeedComparison:
 def read_sweep(folder: Path | str) -> SweepTable:
     """Return the table of the sweep in `folder`.
 
-    Raises `CallError` if there is none, and `DataError` for an invalid table.
+    Raises `CallError` if the folder has no table, and `DataError` for an invalid table.
     """
     path = Path(folder) / SWEEP_FILE
     try:
@@ -186,7 +186,10 @@ def _ranked(
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
-    """Return a row for every comparison and estimator; those of the first metric over several seeds are shown."""
+    """Return a row for every comparison and estimator.
+
+    Only rows of the first metric, over several seeds, are shown.
+    """
     records = [
         {
             **dict(zip(axes, item.point, strict=True)),

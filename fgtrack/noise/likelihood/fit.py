@@ -51,7 +51,7 @@ class Cost(NamedTuple):
     gradient: FloatArray
     """Shape (f,)."""
     information: FloatArray
-    """Expected information of the innovations plus that of the prior, shape (f, f); positive definite.
+    """Expected information of the innovations and the prior, shape (f, f); positive definite.
 
     For normal innovations it is sum of tr(S^-1 dS S^-1 dS) / 2 + dy' S^-1 dy. The
     shares of outliers change neither y nor S; their information is the sum of squared

@@ -1,8 +1,8 @@
 """Log-likelihood of innovations for many parameter vectors at once, linearised about one trajectory.
 
-Along a fixed trajectory only the noise depends on the parameters. The trajectory is
-that of the filter itself (`filtered`). So each linearisation depends on earlier
-measurements only, and the score has mean zero at the true parameters.
+Along a fixed trajectory only the noise depends on the parameters. The filter itself
+makes the trajectory (`filtered`). So each linearisation depends on earlier measurements
+only, and the score has mean zero at the true parameters.
 
 Source: Schweppe 1965, "Evaluation of likelihood functions for Gaussian signals", IEEE
 Transactions on Information Theory 11(1).

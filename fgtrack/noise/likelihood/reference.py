@@ -14,7 +14,7 @@ from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.noise.likelihood.contaminated import Update, update
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
 
-# A window of successive innovations is mixed if more than this share of them are outliers.
+# Number of successive innovations in a window, and the share of outliers above which the window is mixed.
 _WINDOW = 20
 _MAX_OUTLIERS = 0.5
 # Observations within this time of a mixed window are excluded too.

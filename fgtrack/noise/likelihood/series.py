@@ -21,8 +21,8 @@ from fgtrack.models.motion import CT, CTRV, MotionModel, WhiteNoise
 class NoiseSpace:
     """Names and order of the positive noise parameters in one vector.
 
-    The vector contains the noise of the motion, the standard deviations of each sensor,
-    and the share of outliers of each sensor.
+    First comes the noise of the motion, then the standard deviations of each sensor.
+    The share of outliers of each sensor comes last.
     """
 
     motion_names: tuple[str, ...]
@@ -65,7 +65,7 @@ class NoiseSpace:
         """Split the process noise at states `x` (..., n): Q = rest + sum of value_i^2 part_i.
 
         Returns the rest (..., n, n) and the parts (q, ..., n, n), over the durations
-        `dt_s` (...). Returns None if Q has no such parts: the noise is not white, or a
+        `dt_s` (...). Returns None if Q cannot be split: the noise is not white, or a
         yaw rate relaxes. In the second case F depends on the density too.
         """
         model = self.motion_model(np.ones(self.num_motion))
@@ -97,7 +97,7 @@ class Observation:
     assumed: tuple[int, ...]
     """Indices of the assumed components."""
     axes: FloatArray
-    """Rotation T from the axes of the sensor's standard deviations to those of the measurement, shape (d, d)."""
+    """Rotation T from the axes of the sensor's standard deviations to the axes of the measurement, shape (d, d)."""
     own: FloatArray
     """Covariance that replaces the sensor's standard deviations, shape (d, d).
 
@@ -140,7 +140,7 @@ class Series:
     mixed: frozenset[int] = frozenset()
     """Indices of observations whose innovations do not contribute, see `with_mixed_marked`."""
     settle_s: float = 1.0
-    """Innovations of these first seconds do not contribute, as they depend on the first state.
+    """Length of the first part whose innovations do not contribute, as they depend on the first state.
 
     The time counts from the end of the nominal trajectory.
     """

@@ -114,7 +114,7 @@ _Curve = tuple[str, CurveStyle, float, IntArray, Mapping[str, FloatArray]]
 def _curves(
     runs: Mapping[EvaluatedRun, Matching], object_id: int | None
 ) -> list[_Curve]:
-    """Return the errors of the present states of every run, then those of final states."""
+    """Return the errors of the present states of every run, then the errors of final states."""
     styles = run_styles(list(runs))
     first_ns = {
         item: start_ns(group) for group in by_recording(list(runs)) for item in group

@@ -43,12 +43,13 @@ def close_ups(
     """Return close-ups of one late detection in each of `runs`: its track before and after the fusion.
 
     The detection is a typical one among those that lower the present error of the first
-    run, see `chosen`. With `stamp_ns` it is the one with the nearest stamp. `runs` are
-    runs of one recording, or their folders. The recording is replayed up to the
-    detection for every run. `fgtrack.plot.close_up` draws the result.
+    run, see `chosen`. With `stamp_ns` it is the detection with the nearest stamp.
+    `runs` are runs of one recording, or their folders. The recording is replayed up to
+    the detection for every run. `fgtrack.plot.close_up` draws the result.
 
     Raises `CallError` if a folder is not a run. Raises `DataError` if the first run
-    fused no such detection, another run did not fuse it, or a recording is missing.
+    fused no late detection, or a run did not fuse the chosen one. Also if a recording
+    is missing.
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
     arrival, rule = chosen(read, stamp_ns)
@@ -58,7 +59,7 @@ def close_ups(
 def drawn_close_up(
     runs: Sequence[EvaluatedRun], stamp_ns: int | None = None, **paper: Unpack[Paper]
 ) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
-    """Return the named figure of `close_ups` and its first close-up; no figure and the error if there is none.
+    """Return the named figure of `close_ups` and its first close-up; without a close-up no figure, and the error.
 
     It covers the runs of the same recording as the first run.
     """
@@ -159,7 +160,7 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
 
 
 def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
-    """Return the states at the descending `stamps_ns`, as far as the track's window reaches back."""
+    """Return the states at the descending `stamps_ns`, back to the start of the track's window."""
     states = []
     for stamp_ns in stamps_ns:
         try:

@@ -139,7 +139,7 @@ class _Window(NamedTuple):
 def _window(run: Run) -> _Window | None:
     """Return the window around the track with the most updates within `_AROUND_S` of a stamp.
 
-    None without updates. The first of several such stamps is used.
+    None without updates. If several stamps have as many updates, the first is used.
     """
     used = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0)
     around_ns = nanoseconds(_AROUND_S)

@@ -121,7 +121,7 @@ def settings(
 ) -> Any:  # Any: keys of rcParams are a Literal of all names
     """Return the rcParams of a figure on `paper`.
 
-    The user's own values win over those of fgtrack, and the style and font of `paper`
+    The user's own values win over fgtrack's values. The style and font of `paper` win
     over both. Raises `CallError` for an invalid width, style or font.
     """
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}

@@ -126,7 +126,7 @@ def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
 
 
 def planned_sweep(table: SweepTable) -> list[Planned]:
-    """Return the figures of a sweep, one for each metric; only a few of them are no extras."""
+    """Return the figures of a sweep, one for each metric; most are extras."""
     first, rest = sweep_metrics(table)
     return [
         Planned(f"sweep_{metric}", partial(sweep, table, metric), metric in rest)

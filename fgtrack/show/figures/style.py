@@ -82,7 +82,7 @@ class StyledFigure(Figure):
 
 
 def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, CurveStyle]:
-    """Return the curve style of each run by label; the colours are those of the estimators."""
+    """Return the curve style of each run by label, in the colour of its estimator."""
     result = styles(
         [str(item.run.meta.get("estimator") or item.label) for item in runs]
     )
