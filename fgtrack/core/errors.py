@@ -1,11 +1,15 @@
 """Errors that a user sees as one line: what is wrong, where, and what to do."""
 
 import difflib
+import re
 from collections.abc import Iterable
 
 #: Longest message in characters, and the characters of its end that are kept if it is longer.
 _LONGEST = 700
 _TAIL = 250
+#: A run of characters without a space that is longer than this keeps its two ends only.
+_LONG_WORD = re.compile(r"\S{201,}")
+_WORD_HEAD, _WORD_TAIL = 100, 60
 
 
 class FgtrackError(Exception):
@@ -35,13 +39,20 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 def one_line(text: str) -> str:
     """Return `text` on one line; control characters, which names from files may contain, are escaped.
 
-    The middle of a long text is left out.
+    The middle of a long text, or of a long run of characters without a space, is left out.
     """
+    text = _LONG_WORD.sub(_without_middle, text)
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
     return printable(
         " ".join(text.split()) if any(space in text for space in "\n\r\t\v\f") else text
     )
+
+
+def _without_middle(match: re.Match[str]) -> str:
+    """Return the two ends of a long word."""
+    word = match[0]
+    return f"{word[:_WORD_HEAD]}...{word[-_WORD_TAIL:]}"
 
 
 def printable(text: str) -> str:

@@ -32,3 +32,12 @@ def test_a_line_of_any_script_stays_as_it_is() -> None:
 
 def test_half_a_surrogate_can_be_printed() -> None:
     one_line("name \udce4").encode("utf-8")
+
+
+def test_a_name_without_end_does_not_hide_the_message() -> None:
+    message = str(DataError(f"sensor '{'x' * 5000}' has no model: add a model"))
+    assert message.startswith("sensor 'xxx")
+    assert message.endswith("' has no model: add a model")
+    assert len(message) < 300
+    path = f"/{'folder/' * 20}drive.mcap"
+    assert one_line(f"{path}: is empty") == f"{path}: is empty"
