@@ -2,8 +2,8 @@
 
     python experiments/bench_banks.py
 
-Each list has one measurement of every object, all of one stamp and every fourth list late. Kinds of measurement are
-measured in turns, round after round, so a ratio compares times of the same minute.
+Each list has one measurement of every object, all of one stamp; every fourth list is late. Times are of the processor.
+Kinds of measurements are measured in turns, round after round, so a ratio compares times of the same minute.
 """
 
 import time
@@ -47,7 +47,7 @@ KINDS = (
 
 
 def list_ms(estimator: str, kind: Kind, seed: int = 0) -> float:
-    """Return the median time of the update of all objects by one list, in ms."""
+    """Return the median processor time of the update of all objects by one list, in ms."""
     rng, motion = np.random.default_rng(seed), fgtrack.CTRV()
     model = fgtrack.measurement_model(kind.components, motion)
     std = np.array([_STD[name] for name in kind.components])
@@ -102,7 +102,8 @@ def ratios(
 
 if __name__ == "__main__":
     found = measured(3)
-    for (estimator, label), times in found.items():
-        plain = found[estimator, POSITION.label]
-        ratio = median(a / b for a, b in zip(times, plain, strict=True))
-        print(f"{estimator:16} {label:32} {min(times):8.3f} ms {ratio:8.2f}")
+    for estimator in ESTIMATORS:
+        for kind in (POSITION, *KINDS):
+            least_ms = min(found[estimator, kind.label])
+            ratio = median(ratios(found, estimator, kind))
+            print(f"{estimator:16} {kind.label:32} {least_ms:8.3f} ms {ratio:8.2f}")

@@ -34,6 +34,7 @@ COSTED = (
     200,
     1000,
 )  # objects, whose cost must not grow; a tenth is within the noise
+LARGEST_OVER_POSITION = 4.0  # times the time of x and y
 REQUIRED_READING, LARGEST_REPLAY_S = 20.0, {REPLAY: 3.0, BANDED: 5.0}
 PUBLISHED_MS_PER_US = {1: 0.56, 10: 3.45, 50: 20.4}
 """Median tick of the published implementation in ms per microsecond of yardstick, where its code is not at hand."""
@@ -122,6 +123,8 @@ class Results:
     """Times real time by format, of each round."""
     replay_s: dict[str, list[float]] = field(default_factory=dict)
     """Processor time of `fgtrack replay` of the demo's minute by estimator, of each round."""
+    over_position: dict[str, list[float]] = field(default_factory=dict)
+    """Time of a list of 50 objects over that of a list of x and y, by estimator and kind, of each round."""
     stone_soup_us: float = float("nan")
     """Median time of one prediction and update."""
 
@@ -178,6 +181,16 @@ class Results:
         ):
             what = f"{REPLAY}: cost of an object among {many} over that among {few}"
             promises.append(Promise(what, second / first, 1.1, at_most=True))
+        for what, found in self.over_position.items():
+            promises.append(
+                Promise(
+                    f"{what}, 50 objects: times the time of x and y",
+                    median(found),
+                    LARGEST_OVER_POSITION,
+                    at_most=True,
+                    rounds=found,
+                )
+            )
         for name, times in self.reading.items():
             promises.append(
                 Promise(

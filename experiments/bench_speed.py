@@ -25,6 +25,7 @@ from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
 
+import bench_banks
 import typer
 from bench_report import (
     BANDED,
@@ -195,6 +196,16 @@ def measure_replay(results: Results, demo: Path, folder: Path) -> None:
         results.replay_s.setdefault(name, []).append(_children_s() - before_s)
 
 
+def measure_banks(results: Results) -> None:
+    """Measure lists of 50 objects once, with several kinds of measurements, in the estimators alone."""
+    times_ms = bench_banks.measured(1, progress)
+    for estimator in bench_banks.ESTIMATORS:
+        for kind in bench_banks.KINDS:
+            results.over_position.setdefault(f"{estimator}, {kind.label}", []).extend(
+                bench_banks.ratios(times_ms, estimator, kind)
+            )
+
+
 def _fgtrack(*arguments: object) -> None:
     subprocess.run(
         [sys.executable, "-m", "fgtrack", *map(str, arguments)],
@@ -267,6 +278,7 @@ def main(
             measure_round(results, passes, streams, published)
             measure_reading(results, recordings, short_s)
             measure_replay(results, demo, folder)
+            measure_banks(results)
     results.rows = [
         Row.of(
             one,
