@@ -122,6 +122,9 @@ class GatedEuclidean:
             gates_m if is_one else float(np.max(gates_m, initial=0.0)),
             apart,
         )
+        has_direction = ~np.isinf(candidates.lines[pairs.rows, 2])
+        if not all(has_direction.tolist()):
+            pairs = pairs.at(has_direction)  # no distance shows what these belong to
         if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])

@@ -126,7 +126,10 @@ class FusedRecords:
 def is_usable(
     detection: Detection, sensor: SensorModel, at_origin: bool = False
 ) -> bool:
-    """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0).
+    """True if `detection` has valid values, says where it is, and is not an empty slot (x = y = 0).
+
+    A sensor that measures positions or bearings must give either. Another sensor, as of range rates alone, must give
+    some value: the association finds its object.
     With `at_origin` there are no empty slots: the first position of many recordings is the origin of the map.
     """
     for name in sensor.std:
@@ -140,7 +143,9 @@ def is_usable(
         return False
     if "x_m" in sensor.std and (x_m is not None or y_m is not None):
         return x_m is not None and y_m is not None
-    return "bearing_rad" in sensor.std and detection.bearing_rad is not None
+    if "x_m" in sensor.std or "bearing_rad" in sensor.std:
+        return "bearing_rad" in sensor.std and detection.bearing_rad is not None
+    return any(getattr(detection, name) is not None for name in sensor.std)
 
 
 def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:

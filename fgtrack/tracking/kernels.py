@@ -136,7 +136,8 @@ def described(
     poses: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
     """Return which components detections have, as the bits of a number (m,), and their positions and NaN (m, 3).
-    The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction.
+    The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction; infinity for the
+    direction where there is no bearing either.
     """
     m, num = values.shape
     check(
@@ -157,6 +158,8 @@ def described(
                     poses[k, 1],
                     poses[k, 2] + values[i, BEARING],
                 )
+                if math.isnan(values[i, BEARING]):
+                    lines[i, 2] = math.inf
     return codes, lines
 
 
@@ -227,8 +230,9 @@ def near(
     most: int,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
-    Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction. At most so many tracks of
-    each point, the nearest ones. `by_x` are the tracks in the order of x.
+    Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction, and infinity where the
+    direction is unknown: every track has the distance 0. At most so many tracks of each point, the nearest ones. `by_x`
+    are the tracks in the order of x.
     """
     m, n = len(points), len(means)
     check(len(by_x) >= n and len(reach_m) >= n and most > 0 and points.shape[1] >= 3)
@@ -254,7 +258,9 @@ def near(
             j = by_x[at]
             dx, dy = means[j, 0] - x, means[j, 1] - y
             distance = math.sqrt(dx * dx + dy * dy)
-            if not math.isnan(angle):
+            if math.isinf(angle):
+                distance = 0.0
+            elif not math.isnan(angle):
                 off = math.atan2(dy, dx) - angle
                 distance = (
                     abs(distance * math.sin(off)) if math.cos(off) > 0.0 else distance

@@ -56,7 +56,7 @@ class Candidate(NamedTuple):
     """Positions of the others that were merged into it and have no outcome of their own."""
     measurement: Measurement
     position_m: FloatArray | None
-    """Position in the map, shape (2,); None where only a bearing was measured."""
+    """Position in the map, shape (2,); None where none was measured."""
     position_covariance: FloatArray | None
     """Shape (2, 2)."""
     stamp_std_s: float = 0.0
@@ -168,7 +168,8 @@ class Candidates(Lazy[Candidate]):
         self.leaders, self.merged = leaders, merged
         """See `Candidate`; by leader."""
         self.lines = lines
-        """Positions in the map and NaN, or the position of the sensor and the direction of a bearing, shape (m, 3)."""
+        """Positions in the map and NaN, or the position of the sensor and the direction of a bearing, shape (m, 3).
+        The direction is infinity where there is neither."""
         self.placed: list[bool] = np.isnan(lines[:, 2]).tolist()
         """True of those with a position."""
         self.groups = groups
@@ -403,7 +404,7 @@ class Preprocess:
                 x[:, :2] = (
                     points_m
                     if is_placed
-                    else _far_along(z[:, names.index("bearing_rad")], pose)
+                    else _far_along(_directions_rad(names, z), pose)
                 )
             total = error.noise(models[0], pose, x)
             R = total if white is R else R + (total - white)
@@ -512,6 +513,11 @@ def _components(
         assumed,
         np.where([name in assumed for name in names], -1, columns),
     )
+
+
+def _directions_rad(names: Sequence[str], z: FloatArray) -> FloatArray:
+    """Bearings among the components of z (m, k), shape (m,); along the axis of the sensor where there are none."""
+    return z[:, names.index("bearing_rad")] if "bearing_rad" in names else 0.0 * z[:, 0]
 
 
 def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:
