@@ -455,6 +455,16 @@ class Estimator(Protocol):
         """The clock moved: move the window, nothing else."""
 
 
+def asked_stamp(stamp_ns: object, oldest_ns: int) -> int:
+    """Return a stamp for which a state is asked. Raises `CallError` for an invalid one and before `oldest_ns`."""
+    stamp = as_stamp("stamp_ns", stamp_ns)
+    if stamp < oldest_ns:
+        raise CallError(
+            f"stamp_ns: there is no state at {stamp} ns, the oldest one is at {oldest_ns} ns"
+        )
+    return stamp
+
+
 def described(name: str, motion: MotionModel, window_ns: tuple[int, int]) -> str:
     """Return a line on the estimator `name` of one object: motion model and window, for its repr."""
     oldest_ns, newest_ns = window_ns

@@ -20,6 +20,7 @@ from fgtrack.estimation.base import (
     UpdateResult,
     UpdateStatus,
     WindowBank,
+    asked_stamp,
     described,
 )
 from fgtrack.estimation.failures import EstimatorError
@@ -270,8 +271,15 @@ class SingleObject:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
+        stamp_ns = as_stamp("stamp_ns", stamp_ns)
         with _own_cause():
-            return state_of(self.bank, self._motion, 0, as_stamp("stamp_ns", stamp_ns))
+            states = states_of(self.bank, self._motion, stamp_ns)
+        if not states.track_ids:
+            asked_stamp(stamp_ns, self.window_ns[0])
+            raise CallError(f"stamp_ns: there is no finite state at {stamp_ns} ns")
+        return track_state(
+            self._motion, stamp_ns, states.means[0], states.covariances[0]
+        )
 
     def window(self) -> "Window":
         """Return a copy of the window: states, prior and measurements. Raises `CallError` unless it is a smoother."""

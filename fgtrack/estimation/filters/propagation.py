@@ -1,9 +1,11 @@
 """Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels
 from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
@@ -45,7 +47,14 @@ class ExactPropagator:
 def track_state(
     motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray
 ) -> TrackState:
-    """A state of `motion` as it is handed out, with the yaw in (-pi, pi]."""
+    """A state of `motion` as it is handed out, with the yaw in (-pi, pi].
+
+    Raises `CallError` for a state that is not finite, as after a prediction over a very long time.
+    """
+    if not math.isfinite(mean.sum() + covariance.sum()):
+        raise CallError(
+            f"stamp_ns: the state at {stamp_ns} ns is not finite, is the stamp too far from the measurements?"
+        )
     return TrackState(stamp_ns, wrapped(motion, mean), covariance)
 
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
-from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement, Start, asked_stamp
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import (
     OneCorrection,
@@ -75,7 +74,7 @@ class ReplayEkf(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
-        stamp_ns = as_stamp("stamp_ns", stamp_ns)
+        stamp_ns = asked_stamp(stamp_ns, self.steps[0].stamp_ns)
         before = self.steps[
             max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)
         ]

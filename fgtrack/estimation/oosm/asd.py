@@ -4,10 +4,9 @@ import bisect
 
 import numpy as np
 
-from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement, Start, asked_stamp
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, propagated
 from fgtrack.estimation.filters.propagation import track_state
@@ -45,7 +44,7 @@ class AccumulatedStateDensity(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed, from all measurements."""
-        stamp_ns = as_stamp("stamp_ns", stamp_ns)
+        stamp_ns = asked_stamp(stamp_ns, self._stack[0][0])
         (_, mean, covariance), block = self._with_state(stamp_ns)
         return track_state(
             self._motion, stamp_ns, mean[block].copy(), covariance[block, block].copy()

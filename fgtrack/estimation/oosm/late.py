@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from fgtrack.core.checks import as_stamp
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement, Start, asked_stamp
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import (
     Correction,
@@ -67,7 +66,7 @@ class RewindForget(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
-        stamp_ns = as_stamp("stamp_ns", stamp_ns)
+        stamp_ns = asked_stamp(stamp_ns, self._steps[0].stamp_ns)
         step = self._steps[self._left(stamp_ns)]
         moved = self._moved(
             wrapped(self._motion, step.mean), step.covariance, step.stamp_ns, stamp_ns
