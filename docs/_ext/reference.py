@@ -218,7 +218,10 @@ def _autodoc(name: str, value: Any) -> str:
     if isinstance(value, type):
         return f".. autoclass:: fgtrack.{name}\n   :members:" + "\n   :undoc-members:" * issubclass(value, Enum)
     if isinstance(value, types.ModuleType):
-        members = {one: getattr(value, one) for one in value.__all__}
+        import fgtrack
+
+        own = [one for one in value.__all__ if one not in dir(fgtrack)]  # a public name has an entry of its own
+        members = {one: getattr(value, one) for one in own}
         return "\n\n".join(_autodoc(f"{name}.{one}", member) for one, member in members.items() if callable(member))
     if callable(value):
         return f".. autofunction:: fgtrack.{name}"
