@@ -22,7 +22,7 @@ runs = [
 ]
 
 # %%
-# The present states. Backward-forward is not replay: a late LiDAR update wipes the RADAR updates fused since. The
+# The present states. Backward-forward is not a replay: a late LiDAR update erases the RADAR updates fused since. The
 # replaying EKF and the smoother keep them and nearly tie.
 tables = fgtrack.compare(*runs)
 print(tables[["tracking"]])
