@@ -9,8 +9,14 @@ import numpy as np
 from fgtrack.core.finding import Finding, percent
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.comparison import POSITION_NEES, comparisons
-from fgtrack.evaluation.diagnostics import CORRELATED, FAR_OFF, FEWEST, USED, misfits
-from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
+from fgtrack.evaluation.diagnostics import (
+    CORRELATED,
+    FAR_OFF,
+    FEWEST,
+    USED,
+    inconsistent_sensors,
+)
+from fgtrack.evaluation.intervals import Estimate, mean_square, sums_by_stamp
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.innovations import autocorrelation, num_measured
@@ -73,7 +79,7 @@ def noise_fits(run: Run) -> list[NoiseFit]:
         samples = np.stack(
             [updates["nis"][mine], dof[mine].astype(np.float64)], axis=-1
         )
-        ratio = mean_square(by_stamp(updates["stamp_ns"][mine], samples))
+        ratio = mean_square(sums_by_stamp(updates["stamp_ns"][mine], samples))
         white = autocorrelation(updates.where(updates["sensor"] == sensor))
         fits.append(
             NoiseFit(
@@ -85,7 +91,7 @@ def noise_fits(run: Run) -> list[NoiseFit]:
 
 def noise_findings(outcome: "RunQuality") -> Iterator[Finding]:
     """Yield the sensors with inconsistent noise, and those with a few very large innovations."""
-    off = dict(misfits(outcome.run))
+    off = dict(inconsistent_sensors(outcome.run))
     for one in outcome.noise:
         if one.sensor in off:
             factor = math.sqrt(one.ratio.mean)
@@ -234,7 +240,7 @@ def objection(before: RunQuality, after: RunQuality) -> str | None:
             "sensor, or of the most accurate one (sensors.NAME.correlation), with std and time_s from truth or a data "
             "sheet"
         )
-    for sensor, nis in misfits(after.run):
+    for sensor, nis in inconsistent_sensors(after.run):
         return f"mean NIS of {sensor} is {nis.mean:.3g}, expected {nis.dof:.3g}"
     if (worse := harm(before, after)) is not None:
         return f"{worse}: errors are larger than this noise, so tracks break"

@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, sums_by_stamp, within_run
 from fgtrack.evaluation.matching import (
     TrackErrors,
+    during_truth,
     position_nees,
-    recorded,
     scenes,
     track_errors,
 )
@@ -191,7 +191,7 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
             [item.values[name][row] for item, row in zip(every, rows, strict=True)],
             axis=-1,
         )
-        sums[name] = by_stamp(every_ns[common % len(every_ns)], values)
+        sums[name] = sums_by_stamp(every_ns[common % len(every_ns)], values)
     return max(len(distinct) for distinct, _ in samples), len(common), sums
 
 
@@ -222,7 +222,7 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """
     matchings = [item.matching for item in group if item.matching is not None]
     ticks_ns = [
-        item.now_ns[recorded(each.run, item.now_ns)]
+        item.now_ns[during_truth(each.run, item.now_ns)]
         for each, item in zip(group, matchings, strict=True)
     ]
     common_ns = functools.reduce(np.intersect1d, ticks_ns)

@@ -44,7 +44,7 @@ _YAWS_SHARE = 0.05
 # A damped step is no failure: it is usual with bearings.
 _NO_FAILURE = "step damped"
 #: Cause and remedy by disposition, for a sensor with most detections in this disposition.
-_CURES = {
+_REMEDIES = {
     "gated": "no track was near and no track was started: check the gate of `association`, the clock, and "
     "ego.detection_origin_x_m",
     "out_of_bounds": "{reasons}: check these settings, the map (--map), and the frame of the detections",
@@ -117,7 +117,7 @@ def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
         if run.path is not None and source
         else ""
     )
-    for sensor, nis in misfits(run):
+    for sensor, nis in inconsistent_sensors(run):
         size = "small" if nis.mean > nis.dof else "large"
         # The mean may be negative by rounding, if two standard deviations differ by a factor of 1e9.
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)
@@ -129,7 +129,7 @@ def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
         yield Diagnostic(sensor, text)
 
 
-def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
+def inconsistent_sensors(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
     """Yield the sensors with inconsistent NIS, and their NIS.
 
     Mean and median must both deviate in the same direction, so that a few outliers do
@@ -201,7 +201,9 @@ def _angles(run: Run) -> Iterator[Diagnostic]:
 def _ego(run: Run) -> Iterator[Diagnostic]:
     """Yield a missing ego, a late ego, jumps, and reasons for which most ego states were refused."""
     num_states = run.tables["ego"].num_rows
-    if not num_states and any(name == "failed" for _, _, name, _ in _mostly(run)):
+    if not num_states and any(
+        name == "failed" for _, _, name, _ in _mostly_unused(run)
+    ):
         yield Diagnostic(
             EGO,
             f"no state was received, so detections in its frame cannot be transformed: {_NAME_EGO}",
@@ -252,8 +254,8 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     ]
     if blind:
         text = f"no map, and {', '.join(blind)} reports no heading: new objects may move in any direction"
-        cure = "give a map with --map (`oval` for the simulated races), or set birth.ego_speed_factor: 0 in open space"
-        yield Diagnostic("map", f"{text}; {cure}", _STANDING)
+        remedy = "give a map with --map (`oval` for the simulated races), or set birth.ego_speed_factor: 0 in open space"
+        yield Diagnostic("map", f"{text}; {remedy}", _STANDING)
 
 
 def _ego_speeds_births(run: Run) -> bool:
@@ -264,7 +266,7 @@ def _ego_speeds_births(run: Run) -> bool:
     )
 
 
-def _mostly(run: Run) -> Iterator[tuple[str, Columns, str, int]]:
+def _mostly_unused(run: Run) -> Iterator[tuple[str, Columns, str, int]]:
     """Yield sensors with more than half of their updates unused for one disposition.
 
     Yields the sensor, its updates, the disposition, and its count.
@@ -285,7 +287,7 @@ def _sensors(run: Run) -> Iterator[Diagnostic]:
     for sensor in unset:
         text = "all stamps are 0: its driver does not set them; `stamp_from: receipt` uses the receipt as the stamp"
         yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
-    for sensor, mine, name, count in _mostly(run):
+    for sensor, mine, name, count in _mostly_unused(run):
         if (name == "too_old" and sensor in unset) or (
             name == "failed" and not run.tables["ego"].num_rows
         ):
@@ -295,17 +297,17 @@ def _sensors(run: Run) -> Iterator[Diagnostic]:
         ):
             continue  # copies from several receivers are expected
         by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
-        cure = (
+        remedy = (
             _too_old(run, sensor, mine)
             if name == "too_old"
-            else _CURES[name].format(sensor=sensor, reasons=by)
+            else _REMEDIES[name].format(sensor=sensor, reasons=by)
         )
-        yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {cure}")
+        yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {remedy}")
 
 
 def _latency(run: Run) -> Iterator[Diagnostic]:
     """Yield delays beyond the limits of the estimator or the inbox, unless most detections already have a reason."""
-    explained = {sensor for sensor, _, _, _ in _mostly(run)}
+    explained = {sensor for sensor, _, _, _ in _mostly_unused(run)}
     for sensor, mine in by_sensor(run.tables["updates"]):
         if sensor not in explained and mine["stamp_ns"].any():
             delays_s = (mine["receipt_ns"] - mine["stamp_ns"]) / NS_PER_S
@@ -350,8 +352,8 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
             if run.meta.get("first_failure")
             else ""
         )
-        cure = "these tracks are less accurate; check NIS by sensor, noise, clocks and first states"
-        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}{first}: {cure}"
+        remedy = "these tracks are less accurate; check NIS by sensor, noise, clocks and first states"
+        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}{first}: {remedy}"
         yield Diagnostic("estimator", text)
 
 

@@ -136,7 +136,7 @@ def mean_square(ticks: FloatArray) -> Estimate:
     return Estimate(mean, low, high, log.count)
 
 
-def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
+def sums_by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
     """Sums of `samples` (n, k) over each stamp in ascending order, and in the last column their number.
 
     A row with NaN is ignored.

@@ -49,7 +49,7 @@ def write_kitti_result(
             f"{sequence}: not a sequence of the KITTI data set, give its oxts/NNNN.txt"
         )
     check_no_overlap(out, [sequence, *(() if run.path is None else (run.path,))])
-    views = _located(run, view_of_sequence(sequence))
+    views = _with_ego_positions(run, view_of_sequence(sequence))
     states = _states(run, len(views))
     without = set(states["track_id"][states["length_m"].isna()])
     lines = []
@@ -67,7 +67,7 @@ def write_kitti_result(
     return len(lines), len(tracks), len(without - tracks)
 
 
-def _located(run: Run, views: list[View]) -> list[View]:
+def _with_ego_positions(run: Run, views: list[View]) -> list[View]:
     """Return `views` with the ego positions of ego.csv, the frame of the tracks."""
     frames_ns = np.arange(len(views)) * PERIOD_NS
     positions = ego_states(run.tables["ego"], frames_ns)[:, :2].tolist()

@@ -107,7 +107,9 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     timing = run.tables["timing"]
     tracks = run.tables["tracks"]
     # A tick without a row in timing.csv was interrupted.
-    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], timing["tick"])
+    kept = during_truth(run, tracks["stamp_ns"]) & np.isin(
+        tracks["tick"], timing["tick"]
+    )
     tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
@@ -243,7 +245,7 @@ def scenes(run: Run, matching: Matching) -> Scenes:
 
     Distances are those at the stamps of the rows.
     """
-    scored = recorded(run, matching.now_ns)
+    scored = during_truth(run, matching.now_ns)
     rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
     tick_index = (np.cumsum(scored) - 1)[matching.tick_index[rows]]
@@ -297,7 +299,7 @@ def neighbours(
     return before, after
 
 
-def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
+def during_truth(run: Run, stamps_ns: IntArray) -> BoolArray:
     """Mask of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
     truth_ns = run.tables["truth"]["stamp_ns"]
     return np.asarray((stamps_ns >= truth_ns.min()) & (stamps_ns <= truth_ns.max()))

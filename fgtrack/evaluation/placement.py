@@ -18,7 +18,7 @@ _KEY = ["sensor", "stamp_ns", "receipt_ns", "index"]
 
 
 @dataclass(frozen=True)
-class Placed:
+class DetectionsInMap:
     """Detections of a run in the map frame, in the order of `Run.detections`."""
 
     position_m: FloatArray
@@ -31,7 +31,7 @@ class Placed:
     """Direction from the sensor, shape (n,); NaN if not measured."""
 
 
-def placed(run: Run) -> Placed:
+def detections_in_map(run: Run) -> DetectionsInMap:
     """Return the detections of `run` in the map frame.
 
     The ego poses come from ego.csv, with linear interpolation between stamps.
@@ -69,7 +69,7 @@ def placed(run: Run) -> Placed:
     )
     yaw_rad = np.where(in_map, table["yaw_rad"], table["yaw_rad"] + sensor_rad)
     with np.errstate(invalid="ignore"):  # angles may be infinite
-        return Placed(
+        return DetectionsInMap(
             position_m, wrap_angles(yaw_rad), sensor_m, wrap_angles(bearing_rad)
         )
 

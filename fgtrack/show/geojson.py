@@ -11,7 +11,7 @@ from fgtrack.core.output import check_no_overlap, check_output, new_path, write_
 from fgtrack.core.time import seconds
 from fgtrack.inputs.geodetic import GEODETIC, latitudes_longitudes_deg
 from fgtrack.runs import Run
-from fgtrack.show.states import located
+from fgtrack.show.states import with_position
 
 _DIGITS = 7  # of a degree: about a centimetre
 
@@ -37,7 +37,8 @@ def write_geojson(run: Run, out: Path, *, overwrite: bool = False) -> int:
         )
     check_output(out, overwrite)
     check_no_overlap(out, [run.path])
-    tracks, objects = located(run.tables["tracks"]), run.tables["objects"]
+    tracks = with_position(run.tables["tracks"])
+    objects = run.tables["objects"]
     latitude_deg, longitude_deg = latitudes_longitudes_deg(
         origin_deg, tracks["x_m"], tracks["y_m"]
     )

@@ -11,7 +11,12 @@ import numpy.typing as npt
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.diagnostics import USED
-from fgtrack.evaluation.placement import placed, road_lines, roads, update_rows
+from fgtrack.evaluation.placement import (
+    detections_in_map,
+    road_lines,
+    roads,
+    update_rows,
+)
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.runs import Columns, Run
 from fgtrack.show.palette import SENSORS, distinct_colours
@@ -20,9 +25,9 @@ from fgtrack.show.states import (
     NOMINAL_SIZE_M,
     ellipses,
     final_ns,
-    located,
     start_ns,
     track_positions,
+    with_position,
 )
 
 MOST_ROWS = 60_000
@@ -94,7 +99,7 @@ class _Recording:
 
     def rows(self, states: Columns, time: str, *order: str) -> Columns:
         """Return the rows of `states` with a position and a time, sorted by `time` and `order`."""
-        states = located(states)
+        states = with_position(states)
         states = states.where(np.isfinite(self.seconds(states[time])))
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
         return Columns({name: values[keys] for name, values in states.items()})
@@ -185,7 +190,7 @@ class _Recording:
         """
         table = run.tables["detections"]
         updates = run.tables["updates"]
-        where = placed(run)
+        where = detections_in_map(run)
         rows = update_rows(run)
         sensors, sensor = np.unique(table["sensor"], return_inverse=True)
         # Row -1 selects the empty text at the end.

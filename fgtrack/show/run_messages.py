@@ -20,7 +20,12 @@ from fgtrack.core.types import (
     EgoState,
     IntArray,
 )
-from fgtrack.evaluation.placement import Placed, placed, road_lines, update_rows
+from fgtrack.evaluation.placement import (
+    DetectionsInMap,
+    detections_in_map,
+    road_lines,
+    update_rows,
+)
 from fgtrack.inputs.ros.bag_writer import topic_part
 from fgtrack.models.track_map import TrackMap
 from fgtrack.runs import NO_TRACK, Columns, Run
@@ -31,8 +36,8 @@ from fgtrack.show.states import (
     ellipses,
     final_ns,
     groups,
-    located,
     track_positions,
+    with_position,
 )
 
 Messages = Iterator[ViewerMessage]
@@ -105,7 +110,7 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
 
 def truth_messages(truth: Columns) -> Iterator[Messages]:
     """Yield two streams: boxes and poses of the true objects at every stamp, without the ego."""
-    table = located(truth.where(truth["object_id"] != EGO_ID))
+    table = with_position(truth.where(truth["object_id"] != EGO_ID))
     states = [
         Detection(x_m, y_m, _known(yaw_rad), object_id=object_id)
         for object_id, x_m, y_m, yaw_rad in _rows(
@@ -128,7 +133,7 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     yield from _track_messages(run, layer)
     yield _past_messages(run, layer)
     # A state is shown when it has become final.
-    final = located(
+    final = with_position(
         run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
     )
     states = _states(final, run.tables["objects"])
@@ -141,7 +146,7 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     """Yield, for every tick, boxes with names and speeds, 2-sigma ellipses of the positions, and poses."""
-    tracks = located(run.tables["tracks"])
+    tracks = with_position(run.tables["tracks"])
     states = _states(tracks, run.tables["objects"])
     axes = ellipses(tracks, _DEVIATIONS).tolist()
     facts = list(_rows(tracks, "track_id", "status", "speed_mps"))
@@ -209,7 +214,10 @@ def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 def _past_messages(run: Run, layer: RunLayer) -> Messages:
     """Yield, for every tick, the past of each track: a line through its lagged states up to the present state."""
-    lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
+    lagged, present = (
+        with_position(run.tables["lagged"]),
+        with_position(run.tables["tracks"]),
+    )
     lagged = lagged.where(lagged["lag_s"] > 0.0)
     present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
     names = ("now_ns", "track_id", "stamp_ns", "x_m", "y_m")
@@ -243,7 +251,7 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
     detection, and faint otherwise.
     """
     table = run.tables["detections"]
-    where = placed(run)
+    where = detections_in_map(run)
     rows = update_rows(run)
     # Row -1 selects the empty text at the end.
     dispositions = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")
@@ -298,7 +306,7 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
             )
 
 
-def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
+def _mark(where: DetectionsInMap, row: int, colour: Colour) -> Shape | None:
     """Return a sphere at the position of a detection, or a line of sight for a bearing alone.
 
     None without an ego pose.

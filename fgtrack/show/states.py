@@ -34,7 +34,7 @@ def ellipses(states: Columns, deviations: float) -> FloatArray:
     return result
 
 
-def located(table: Columns) -> Columns:
+def with_position(table: Columns) -> Columns:
     """Return the rows with a finite position."""
     return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
 

@@ -9,7 +9,7 @@ from support.pictures import faults
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.placement import placed
+from fgtrack.evaluation.placement import detections_in_map
 from fgtrack.show.figures.close_up import Arrival, CloseUp
 from fgtrack.show.figures.late_detection import close_up_of
 from fgtrack.show.palette import style_of
@@ -69,7 +69,7 @@ def test_it_draws_the_past_towards_the_detection_and_is_fused_once(
                 for key in ("sensor", "stamp_ns", "receipt_ns", "index")
             ]
         )
-        (position_m,) = placed(run).position_m[row]
+        (position_m,) = detections_in_map(run).position_m[row]
         k = one.after.stamps_ns.tolist().index(stamp_ns)
         off_m = [
             np.linalg.norm(each.means[k, :2] - position_m)

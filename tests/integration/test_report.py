@@ -15,7 +15,7 @@ import pytest
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.placement import placed
+from fgtrack.evaluation.placement import detections_in_map
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.runs import Columns
 from fgtrack.show.palette import style_of
@@ -195,7 +195,7 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
             "stamp_ns",
         )
         check(one["final"], final.where(final["kind"] == "final"), "stamp_ns")
-        places = zip(("x_m", "y_m"), placed(run).position_m.T, strict=True)
+        places = zip(("x_m", "y_m"), detections_in_map(run).position_m.T, strict=True)
         check(
             one["detections"],
             {**run.tables["detections"], **dict(places)},

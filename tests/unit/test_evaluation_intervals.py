@@ -9,10 +9,10 @@ from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import (
-    by_stamp,
     correlation_length,
     mean_square,
     paired,
+    sums_by_stamp,
     within_run,
 )
 
@@ -94,7 +94,7 @@ def test_without_correlation_the_standard_error_is_the_textbook_one() -> None:
 
 def test_sums_are_those_of_each_stamp_without_what_is_not_known() -> None:
     samples = np.array([[1.0, 10.0], [2.0, np.nan], [4.0, 40.0], [8.0, 80.0]])
-    assert by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [
+    assert sums_by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [
         [4.0, 40.0, 1.0],
         [9.0, 90.0, 2.0],
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, mean_square, sums_by_stamp
 from fgtrack.evaluation.matching import Matching, confirmed, neighbours, position_nees
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.statistics import NORMAL_95, ChiSquareMean, Moments
@@ -199,7 +199,9 @@ def consistency(run: Run, matching: Matching | None) -> Consistency:
     if matching is None or not matching.paired.any():
         return Consistency(ChiSquareMean(), nis, white)
     squares = position_nees(matching)
-    ticks = by_stamp(matching.tracks["stamp_ns"][matching.paired], squares[:, None])
+    ticks = sums_by_stamp(
+        matching.tracks["stamp_ns"][matching.paired], squares[:, None]
+    )
     interval = mean_square(ticks)
     return Consistency(
         ChiSquareMean.of(squares, np.full(len(squares), 2)), nis, white, interval

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, sums_by_stamp, within_run
 from fgtrack.evaluation.matching import (
     Matching,
     TrackErrors,
@@ -87,7 +87,8 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
             )
         )
         reduction = within_run(
-            by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1])
+            sums_by_stamp(states["stamp_ns"], squares),
+            lambda S: 1.0 - np.sqrt(S[0] / S[1]),
         )
         nees = Moments.of(position_squares(states, truth))
         result.append(

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.placement import placed, road_lines, roads
+from fgtrack.evaluation.placement import detections_in_map, road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.runs import Columns, Run
@@ -51,7 +51,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     tracks = (
         every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     )
-    detections_m = placed(one.run).position_m
+    detections_m = detections_in_map(one.run).position_m
     ego_m = _positions(one.run.tables["ego"])
     required = [
         *bounds_m,
