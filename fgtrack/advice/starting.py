@@ -151,7 +151,8 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[InputPart]) -> Input
 def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> InputPart:
     """Return the guess for a topic of an unknown message type.
 
-    Raises `DataError` with the ranges of its fields if it has no position.
+    Raises `DataError` if the type has no position (with the ranges of its fields), or a
+    single pose (with a guess of the mapping).
     """
     messages = [
         one

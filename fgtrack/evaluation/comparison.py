@@ -34,7 +34,7 @@ _ERRORS = {
     "yaw_rmse_rad": "yaw_rad",
 }
 NEGLIGIBLE = 1e-6
-"""Share of a cost that different orders of summation change by rounding."""
+"""A difference below this share of the cost is rounding."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
 def entry_columns(heading: str, name: str = "value") -> list[Column]:
     """Return columns for the value and standing of an entry, and its difference to the best.
 
-    The value of the best entry is bold.
+    The value of the best entry is bold, unless another entry ties with it.
     """
     return [
         Column(

@@ -254,7 +254,7 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     ]
     if blind:
         text = f"no map, and {', '.join(blind)} reports no heading: new objects may move in any direction"
-        remedy = "give a map with --map (`oval` for the simulated races), or set birth.ego_speed_factor: 0 in open space"
+        remedy = "give a map with --map (`oval` for the simulated races); in open space set birth.ego_speed_factor: 0"
         yield Diagnostic("map", f"{text}; {remedy}", _STANDING)
 
 

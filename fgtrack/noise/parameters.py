@@ -189,7 +189,7 @@ class InnovationFit:
     before: float
     """Mean of the squared innovation over its variance, expected 1, with the configured noise."""
     after: float
-    """The same mean with the noise fitted to the first part."""
+    """Mean of the squared innovation over its variance with the noise fitted to the first part."""
     band: float
     """Half-width of the 95 % interval of the mean for independent innovations."""
 

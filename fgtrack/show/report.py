@@ -41,7 +41,7 @@ class ReportHead:
     advice: Sequence[str] = ()
     """Sentences of the advice."""
     moment: Moment | None = None
-    """Time [ns], x and y [m] that the viewer shows first; None for an early late detection."""
+    """Time [ns], x and y [m] that the viewer shows first; None: the viewer chooses an early late detection."""
     missing: Sequence[str] = ()
     """A line for each content that the report lacks."""
 

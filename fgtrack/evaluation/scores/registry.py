@@ -1,4 +1,4 @@
-"""Metrics of all tracks by name, plug-ins included: functions of scenes and a cut-off distance."""
+"""Registry of multi-object metrics by name, plug-ins included."""
 
 import math
 from collections.abc import Mapping
@@ -11,10 +11,13 @@ from fgtrack.evaluation.matching import Scenes
 
 
 class Metric(Protocol):
-    """A metric of all tracks against all true objects: a function, registered in the group `fgtrack.metrics`."""
+    """Metric of all tracks against all true objects: a function in the plug-in group `fgtrack.metrics`."""
 
     def __call__(self, scenes: Scenes, gate_m: float, /) -> Mapping[str, float]:
-        """Return the values of the metric by name, with units; `gate_m` is the largest distance of a pair."""
+        """Return the values of the metric by name, with units in the names.
+
+        `gate_m` is the largest distance of a pair.
+        """
 
 
 METRICS = Registry(
@@ -28,9 +31,10 @@ METRICS = Registry(
 
 
 def registered_metrics(scenes: Scenes, gate_m: float) -> dict[str, dict[str, float]]:
-    """Values of every registered metric, by the name of the metric.
+    """Return the values of every registered metric, by name of the metric.
 
-    Raises `CallError` for a plug-in that fails or does not return numbers by name.
+    Raises `CallError` for a plug-in that fails, or returns anything but numbers by
+    name.
     """
     return {
         name: _values(name, metric, scenes, gate_m)

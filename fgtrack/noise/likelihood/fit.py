@@ -136,7 +136,7 @@ class Likelihood:
         return Cost(objective, gradient, information, scores)
 
     def log_std(self, logs: FloatArray) -> FloatArray:
-        """Return standard errors of the free logarithms, shape (f,); infinite without information.
+        """Return standard errors of the free logarithms, shape (f,); above 30 without information.
 
         Each is the larger of two errors. The first follows from the curvature of the
         log-likelihood. The second is the sandwich of the curvature and of the scores,

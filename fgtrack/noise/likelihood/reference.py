@@ -23,7 +23,7 @@ _MARGIN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class FilterStep:
-    """Filter step of one observation with d measured and a assumed components."""
+    """Filter step of one observation; d and a are its numbers of measured and assumed components."""
 
     observation: Observation
     since_s: float

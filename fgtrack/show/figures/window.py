@@ -1,4 +1,4 @@
-"""The figure of a window: its factor graph along the time axis, before and after a change."""
+"""Figure of a smoothing window: its factor graph over time, before and after a change."""
 
 from itertools import pairwise
 from typing import Unpack
@@ -14,8 +14,9 @@ from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import GREY, legend_above
 
 _STATE, _CHANGED, _BLACK = "#2F93C6", "#B65CA8", "#000000"
-_GRAPH_IN, _SPREAD_IN = 1.2, 1.7  # heights of the panels
-#: Heights of the rows of a graph: states and motion, measurements, and their edge.
+# Heights of the panels.
+_GRAPH_IN, _SPREAD_IN = 1.2, 1.7
+# Heights in a graph: of states and motion factors, of measurements, and of the upper edge.
 _STATES, _MEASUREMENTS, _TOP = 0.0, 1.0, 1.45
 
 
@@ -23,10 +24,11 @@ _STATES, _MEASUREMENTS, _TOP = 0.0, 1.0, 1.45
 def window(
     after: Window, before: Window | None = None, **paper: Unpack[Paper]
 ) -> Figure:
-    """A window as a factor graph over time, and the standard deviation of the position of its states.
+    """Factor graph of a window over time, and the position standard deviation of its states.
 
-    With the window `before`, both graphs are drawn. What the change has added stands out in the second one, and the
-    motion factor that it has split in the first one.
+    With the window `before`, both graphs are drawn. The second graph highlights what
+    the change added. The first graph highlights the motion factor that the change
+    split.
     """
     graphs = {"window": after}
     if before is not None:
@@ -57,7 +59,7 @@ def window(
 
 
 def _draw_graph(axes: Axes, one: Window, other: Window, first_ns: int) -> None:
-    """Draw the states, the motion between them and the measurements; what `other` lacks stands out."""
+    """Draw states, motion factors and measurements; elements that `other` lacks are highlighted."""
     times_s = _times_s(one, first_ns)
     links = list(pairwise(one.stamps_ns))
     kept_links = set(pairwise(other.stamps_ns))
@@ -85,7 +87,7 @@ def _draw_graph(axes: Axes, one: Window, other: Window, first_ns: int) -> None:
 
 
 def _legend(axes: Axes, has_changes: bool) -> None:
-    """Legend above the first graph."""
+    """Draw the legend above the first graph."""
     entries = [
         ("o", _STATE, "state"),
         ("D", _BLACK, "marginalised prior"),
@@ -103,5 +105,5 @@ def _times_s(one: Window, first_ns: int) -> list[float]:
 
 
 def _position_deviations_m(one: Window) -> FloatArray:
-    """Root of the mean of the variances of x and y, shape (m,)."""
+    """Position standard deviation of each state, shape (m,): the root of the mean variance of x and y."""
     return np.asarray(np.sqrt(one.covariances[:, [0, 1], [0, 1]].mean(axis=1)))
