@@ -44,13 +44,15 @@ from fgtrack.show.report import ReportHead, write_report
 
 __all__ = ["ESTIMATORS", "Study", "study"]
 
-_PERCENT, _MS = 100.0, 1e3
+_PERCENT = 100.0
+_MS = 1e3
 # A finding of this weight without a setting must be corrected first.
 _IMPORTANT = 60.0
 
 
 def _recording(one: EvaluatedRun) -> str:
-    updates, now_ns = one.run.tables["updates"], one.run.tables["timing"]["now_ns"]
+    updates = one.run.tables["updates"]
+    now_ns = one.run.tables["timing"]["now_ns"]
     length_s = (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
     sensors = []
     for sensor in np.unique(updates["sensor"]).tolist():
@@ -126,7 +128,11 @@ def _several(count: int, what: str, ending: str = "s") -> str:
 ESTIMATORS = ("smoother", REPLAY, "ekf-backward-forward")
 """Estimators of a study."""
 #: Finished share of the work at the start of each step.
-_ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
+_ADVICE = 0.02
+_REPLAY = 0.3
+_COMPARE = 0.85
+_DRAW = 0.9
+_DONE = 1.0
 # Number of messages between two progress reports.
 _MESSAGES = 1000
 OnStep = Callable[[str, float], None]

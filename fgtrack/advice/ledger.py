@@ -321,7 +321,8 @@ def _policies(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
 
 
 def _waiting(policies: Mapping[str, Squares]) -> Table:
-    filters, smoothers = policies[REPLAY], policies[SMOOTHER]
+    filters = policies[REPLAY]
+    smoothers = policies[SMOOTHER]
     common: BoolArray = np.all(np.isfinite([*filters, *smoothers]), axis=0)
     records = [
         {

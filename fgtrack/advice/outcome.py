@@ -70,7 +70,8 @@ class NoiseFit:
 
 def noise_fits(run: Run) -> list[NoiseFit]:
     """Return the consistency of every sensor with innovations."""
-    updates, dof = run.tables["updates"], num_measured(run.tables["updates"])
+    updates = run.tables["updates"]
+    dof = num_measured(run.tables["updates"])
     fits = []
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = (updates["sensor"] == sensor) & np.isfinite(updates["nis"]) & (dof > 0)
@@ -249,7 +250,8 @@ def objection(before: RunQuality, after: RunQuality) -> str | None:
         each for one in comparisons(runs) for each in one.quantities.items()
     ):
         result = {entry.name: entry for entry in entries}
-        was, now = result["before"].value, result["after"].value
+        was = result["before"].value
+        now = result["after"].value
         fits = name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF
         if result["after"].standing == "worse" and not fits:
             return f"{name} against the truth of the recording goes from {was:.3g} to {now:.3g}"

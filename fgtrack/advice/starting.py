@@ -343,7 +343,8 @@ def starting_config(recording: Path) -> str:
     parts, refused = _parts(recording)
     taken = _readable(recording, parts, refused)
     config = Config(input=_input(taken))
-    checks, with_sensors = list[str](), Assumed(config)
+    checks = list[str]()
+    with_sensors = Assumed(config)
     try:
         source = open_input(recording, config.input)
         with_sensors = assumed(config, source)

@@ -65,7 +65,8 @@ class EgoPath:
                 f"the ego has {len(by_stamp)} states with different stamps, at least {_FEWEST} are needed"
             )
         stamps_ns = sorted(by_stamp)
-        self._start_ns, self._end_ns = stamps_ns[0], stamps_ns[-1]
+        self._start_ns = stamps_ns[0]
+        self._end_ns = stamps_ns[-1]
         times_s = np.array(
             [seconds(stamp_ns - self._start_ns) for stamp_ns in stamps_ns]
         )

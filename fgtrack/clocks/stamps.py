@@ -142,7 +142,8 @@ def _bound(one: SensorOffset, report: OffsetReport) -> str:
         if (one.offset_s or 0.0) > 0.0
         else (one.sensor, report.reference)
     )
-    least_s, surely_s = report.least_delays_s.get(early, 0.0), report.surely_late_s(one)
+    least_s = report.least_delays_s.get(early, 0.0)
+    surely_s = report.surely_late_s(one)
     if least_s <= RECEIPT_S:
         return f"Either clock may be wrong: without delays of {early} its clock has no bound."
     text = (

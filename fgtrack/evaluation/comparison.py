@@ -120,10 +120,8 @@ def ranked(
 
 def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
     """Return the numbers of an entry for `entry_columns`; `name` is the key of its value."""
-    worse, values = (
-        entry.worse_by or UNKNOWN,
-        {"run": entry.name, name: entry.value, "standing": entry.standing},
-    )
+    worse = entry.worse_by or UNKNOWN
+    values = {"run": entry.name, name: entry.value, "standing": entry.standing}
     return values | {"worse_by": worse.mean, "low": worse.low, "high": worse.high}
 
 

@@ -269,7 +269,8 @@ def _truth_metrics(
 
 
 def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
-    updates, values = run.tables["updates"], residuals(run)
+    updates = run.tables["updates"]
+    values = residuals(run)
     sensors = {}
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor

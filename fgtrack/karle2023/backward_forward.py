@@ -116,7 +116,8 @@ class BackwardForwardBank:
         is_present = grid == self._grid
         if not is_present and grid < max(self._oldest, self._latest_start):
             known = (self._arrays[2][rows, 1] <= grid) & (grid >= self._oldest)
-            rows, track_ids = rows[known], tuple(compress(track_ids, known.tolist()))
+            rows = rows[known]
+            track_ids = tuple(compress(track_ids, known.tolist()))
         if not track_ids:
             return no_states(self._propagator.motion.dim)
         m, n = len(rows), self._propagator.motion.dim
@@ -255,14 +256,16 @@ class BackwardForwardBank:
         for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
             new[:num] = present
         free = [*self._free, *range(num, rows)]
-        self._arrays, self._free = arrays, free
+        self._arrays = arrays
+        self._free = free
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; states are predicted from the newest grid stamp to the present."""
         states = self._at_grid(self._grid)
         if not states.track_ids:
             return []
-        mean, covariance = states.means, states.covariances
+        mean = states.means
+        covariance = states.covariances
         rest_s = seconds(self.present_ns - self._grid_ns)
         if rest_s:
             item = np.ones(len(mean), dtype=np.int64)

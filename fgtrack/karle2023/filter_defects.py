@@ -86,7 +86,8 @@ class PublishedStorage(BackwardForwardBank):
         is_stale: bool,
     ) -> None:
         super().__init__(propagator, step_ns, storage_steps)
-        self._leads, self._is_stale = leads, is_stale
+        self._leads = leads
+        self._is_stale = is_stale
 
     def advance(self, now_ns: int) -> None:
         """See `BackwardForwardBank.advance`.

@@ -45,7 +45,8 @@ class PublishedMap:
             )
         self._segment = np.roll(self._line, -1, axis=0) - self._line
         self._segment_squared = np.sum(self._segment**2, axis=1)
-        self._heading, self._circular = closed("psi_ref_rad"), circular
+        self._heading = closed("psi_ref_rad")
+        self._circular = circular
         normal = np.stack([closed("x_normvec_m"), closed("y_normvec_m")], axis=-1)
         right, left = closed("width_right_m")[:, None], closed("width_left_m")[:, None]
         edges = self._line + normal * right, self._line - normal * left
@@ -69,7 +70,8 @@ class PublishedMap:
             np.searchsorted(self._arc, arc, side="left"), 1, len(self._arc) - 1
         )
         weight = (arc - self._arc[high - 1]) / (self._arc[high] - self._arc[high - 1])
-        low_row, high_row = self._table[high - 1], self._table[high]
+        low_row = self._table[high - 1]
+        high_row = self._table[high]
         row = (high_row - low_row) * weight[:, None] + low_row
         to_right = np.hypot(*(points_m - row[:, 0:2]).T)
         to_left = np.hypot(*(points_m - row[:, 2:4]).T)

@@ -243,7 +243,8 @@ class WhiteNoise(MotionModel):
     @cached_property
     def is_compiled(self) -> bool:
         """True if compiled loops may use the compiled transition, as no subclass has overridden it."""
-        own, names = type(self), ("predict", "jacobian", "process_noise", "transition")
+        own = type(self)
+        names = ("predict", "jacobian", "process_noise", "transition")
         return all(getattr(own, name) is getattr(WhiteNoise, name) for name in names)
 
     def __post_init__(self) -> None:
@@ -270,10 +271,12 @@ class WhiteNoise(MotionModel):
     ) -> Transition:
         """Return the transition without checking `dt_s`; Q has no meaning for a negative duration."""
         t = np.asarray(dt_s, dtype=np.float64)
-        n, shape = self.dim, x.shape[:-1]
+        n = self.dim
+        shape = x.shape[:-1]
         if shape != t.shape:
             shape = np.broadcast_shapes(shape, t.shape)
-            x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
+            x = np.broadcast_to(x, (*shape, n))
+            t = np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
         times_s = np.array(t, order="C").reshape(-1)
         result = Transition(

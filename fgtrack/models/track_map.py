@@ -84,7 +84,8 @@ class TrackMap:
         x, y = np.ascontiguousarray(table[:, :2].T)
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
         heading = np.unwrap(table[:, _COLUMN["psi_ref_rad"]])
-        line, back = x + 1j * y, np.exp(-1j * heading)
+        line = x + 1j * y
+        back = np.exp(-1j * heading)
         others = table[
             :,
             [
@@ -94,7 +95,8 @@ class TrackMap:
         ].T
         # The quantities in the order of a segment row.
         knots = np.stack([x, y, back.real, back.imag, heading, *others, arc])
-        starts, changes = knots[:, :-1], np.diff(knots)
+        starts = knots[:, :-1]
+        changes = np.diff(knots)
         along = (np.diff(line) * [back[:-1], np.diff(back)]).real
         segments = np.concatenate([starts, along[:1], changes, along[1:]]).T.copy()
         for array in (table, arc, segments):
@@ -163,7 +165,8 @@ class TrackMap:
         A positive buffer widens the track. The inner bound is the left one on a track
         that is driven counter-clockwise.
         """
-        left_m, right_m = inner_buffer_m, outer_buffer_m
+        left_m = inner_buffer_m
+        right_m = outer_buffer_m
         if not self.counter_clockwise:
             left_m, right_m = right_m, left_m
         line = np.array(points_m, order="C"), self._segments, self._longest_m

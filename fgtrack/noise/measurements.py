@@ -66,7 +66,8 @@ def recorded_series(
     position. `origin` names the recording in the run.
     """
     bank, run = recorded_bank(messages, config, origin, gate_stds)
-    motion, method = config.motion_model(), config.initiation.method
+    motion = config.motion_model()
+    method = config.initiation.method
     return [series.initiated(motion, method) for series in bank.series()], run
 
 
@@ -91,7 +92,8 @@ class MeasurementRecorder:
     bank: "RecordingBank"
 
     def __init__(self, config: Config, gate_stds: float = 0.0) -> None:
-        self._config, self._gate_stds = config, gate_stds
+        self._config = config
+        self._gate_stds = gate_stds
 
     def __call__(self, parts: TrackerParts) -> TrackerParts:
         """Return the parts of the tracker with the recording bank, which stays available as `bank`."""

@@ -355,7 +355,8 @@ class _Tuning:
                 why[row] = (
                     f"only bounded: {'below' if values[row] < limit else 'above'} {limit:.3g} at 95 %"
                 )
-            values[row], log_std[row] = limit, math.nan
+            values[row] = limit
+            log_std[row] = math.nan
         if not {"yes", "roughly"} & set(known):
             raise self._nothing_to_fit(
                 "no parameter is identifiable from these measurements; use a longer recording"

@@ -69,14 +69,14 @@ def write_foxglove(
             for topic, value in values(message, origin_deg):
                 is_own = isinstance(value, dict)
                 if topic not in channels:
-                    name, encoding, schema = (
-                        "fgtrack.Outcome",
-                        "jsonschema",
-                        json.dumps(_OUTCOME).encode(),
-                    )
+                    name = "fgtrack.Outcome"
+                    encoding = "jsonschema"
+                    schema = json.dumps(_OUTCOME).encode()
                     if not is_own:
                         given = value.get_schema()
-                        name, encoding, schema = given.name, given.encoding, given.data
+                        name = given.name
+                        encoding = given.encoding
+                        schema = given.data
                     schema_id = writer.register_schema(name, encoding, schema)
                     channels[topic] = writer.register_channel(
                         topic, "json" if is_own else "protobuf", schema_id

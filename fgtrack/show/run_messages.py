@@ -41,7 +41,8 @@ from fgtrack.show.states import (
 )
 
 Messages = Iterator[ViewerMessage]
-_WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
+_WHITE = (1.0, 1.0, 1.0, 1.0)
+_GREY = (0.55, 0.55, 0.55, 0.9)
 _OPACITY = {"tentative": 0.15, "coasting": 0.3}
 _CONFIRMED = 0.5  # ellipses and arrows inside the box remain visible
 _SPEED_ARROW_S = 0.25
@@ -214,10 +215,8 @@ def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 def _past_messages(run: Run, layer: RunLayer) -> Messages:
     """Yield, for every tick, the past of each track: a line through its lagged states up to the present state."""
-    lagged, present = (
-        with_position(run.tables["lagged"]),
-        with_position(run.tables["tracks"]),
-    )
+    lagged = with_position(run.tables["lagged"])
+    present = with_position(run.tables["tracks"])
     lagged = lagged.where(lagged["lag_s"] > 0.0)
     present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
     names = ("now_ns", "track_id", "stamp_ns", "x_m", "y_m")

@@ -37,7 +37,8 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     """
     import pandas as pd
 
-    tracks, updates = run.tables["tracks"], run.tables["updates"]
+    tracks = run.tables["tracks"]
+    updates = run.tables["updates"]
     updates = updates.where(
         np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK)
     )

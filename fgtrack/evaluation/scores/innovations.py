@@ -49,7 +49,9 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
     map heading minus the yaw of the track. The states are x, y, yaw and speed at the
     detections. Raises `DataError` for an invalid map.
     """
-    tracks, updates, every = run.tables["tracks"], run.tables["updates"], residuals(run)
+    tracks = run.tables["tracks"]
+    updates = run.tables["updates"]
+    every = residuals(run)
     known = np.isin(updates["track_id"], tracks["track_id"][confirmed(tracks)])
     known &= np.isfinite([every[name] for name in LOCAL_NAMES]).any(axis=0)
     rows = np.flatnonzero(known)
@@ -145,7 +147,8 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     States are linear between published rows, and constant before the first and after
     the last row. NaN for other updates.
     """
-    tracks, updates = run.tables["tracks"], run.tables["updates"]
+    tracks = run.tables["tracks"]
+    updates = run.tables["updates"]
     before, after = neighbours(
         tracks, "stamp_ns", updates["stamp_ns"], updates["track_id"]
     )

@@ -62,7 +62,8 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     """
     if matching is None:
         return ()
-    lagged, smoothed = run.tables["lagged"], run.tables["smoothed"]
+    lagged = run.tables["lagged"]
+    smoothed = run.tables["smoothed"]
     parts: dict[float | Literal["window"], Columns] = {
         lag_s: lagged.where(lagged["lag_s"] == lag_s)
         for lag_s in np.unique(lagged["lag_s"]).tolist()
@@ -123,8 +124,11 @@ def _with_truth(
         matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"]
     )
     alive = (before >= 0) & (after >= 0)
-    states, before, after = states.where(alive), before[alive], after[alive]
-    tracks_ns, stamps_ns = matching.tracks["stamp_ns"], states["stamp_ns"]
+    states = states.where(alive)
+    before = before[alive]
+    after = after[alive]
+    tracks_ns = matching.tracks["stamp_ns"]
+    stamps_ns = states["stamp_ns"]
     rows = np.where(
         stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after
     )

@@ -77,10 +77,8 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
             )
         ],
     )
-    identity, hota = (
-        compute_identity_from_similarity(*frames, AT_GATE),
-        compute_hota_from_similarity(*frames),
-    )
+    identity = compute_identity_from_similarity(*frames, AT_GATE)
+    hota = compute_hota_from_similarity(*frames)
     return MultiObjectMetrics(
         {"c_m": gate_m, "ticks": len(scenes.present), **roots, **means_m2},
         clear(scenes, gate_m),
@@ -100,10 +98,8 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     """CLEAR of `scenes`: pairs of the last tick stay, the rest has the largest sum of similarities within `gate_m`."""
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
-    num_ticks, num_rows = (
-        len(scenes.present),
-        np.bincount(scenes.tick_index, minlength=len(scenes.present)),
-    )
+    num_ticks = len(scenes.present)
+    num_rows = np.bincount(scenes.tick_index, minlength=len(scenes.present))
     used = scenes.present.any(axis=1) & (num_rows > 0)
     last = np.maximum.accumulate(np.where(used, np.arange(num_ticks), 0))
     columns = pair(
@@ -113,8 +109,10 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     track_ids = np.full(scenes.present.shape, NO_TRACK)
     track_ids[scenes.tick_index[paired], columns[paired]] = scenes.track_ids[paired]
     switched = sum(len(switches(column)) for column in track_ids.T)
-    pairs, objects = len(paired), int(scenes.present.sum())
-    misses, false_positives = objects - pairs, len(columns) - pairs
+    pairs = len(paired)
+    objects = int(scenes.present.sum())
+    misses = objects - pairs
+    false_positives = len(columns) - pairs
     return {
         "mota": 1.0 - (misses + false_positives + switched) / objects
         if objects
@@ -135,16 +133,17 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     no sensor could detect.
     """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
-    num_ticks, tick_index = len(scenes.present), scenes.tick_index
+    num_ticks = len(scenes.present)
+    tick_index = scenes.tick_index
     columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))
     rows = np.flatnonzero(columns != NO_OBJECT)
-    columns, ticks = columns[rows], tick_index[rows]
-    squares_m2, paired = (
-        np.square(scenes.distances_m[rows, columns]),
-        np.zeros_like(scenes.present),
-    )
+    columns = columns[rows]
+    ticks = tick_index[rows]
+    squares_m2 = np.square(scenes.distances_m[rows, columns])
+    paired = np.zeros_like(scenes.present)
     paired[ticks, columns] = True
-    single_m2, missed = c_m**2 / 2.0, scenes.present & ~paired
+    single_m2 = c_m**2 / 2.0
+    missed = scenes.present & ~paired
     localisation_m2 = np.asarray(
         np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64
     )
@@ -152,10 +151,8 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     false_m2 = single_m2 * (
         np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1)
     )
-    unseen_m2, total_m2 = (
-        single_m2 * (missed & ~scenes.in_view).sum(axis=1),
-        localisation_m2 + missed_m2 + false_m2,
-    )
+    unseen_m2 = single_m2 * (missed & ~scenes.in_view).sum(axis=1)
+    total_m2 = localisation_m2 + missed_m2 + false_m2
     parts = {
         "localisation_m2": localisation_m2,
         "missed_m2": missed_m2,

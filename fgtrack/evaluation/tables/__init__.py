@@ -182,7 +182,8 @@ class Table:
         `text` escapes a cell, and `bold` is the format of bold cells. A repeated first
         cell is empty.
         """
-        rows, shown = [], self.shown
+        rows = []
+        shown = self.shown
         for record in filter(self.is_main, self.records):
             cells = [
                 (text(column.cell(record)), column.bold(record)) for column in shown
@@ -270,7 +271,8 @@ class Table:
                 box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style=""
             )
             for k in indices:
-                left, heading = shown[k].left, Text(printable_lines(shown[k].heading))
+                left = shown[k].left
+                heading = Text(printable_lines(shown[k].heading))
                 justify: Any = "left" if left else "right"  # Any: rich has a Literal
                 result.add_column(
                     heading,

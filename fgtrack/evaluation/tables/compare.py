@@ -104,10 +104,8 @@ def _differences(compared: Sequence[Comparison]) -> Table:
         for one in compared
         if one.samples < _COMMON_SHARE * one.most_samples
     ]
-    title, columns = (
-        "Differences of runs of the same recording",
-        [quantity, RUN, *entry_columns("value")],
-    )
+    title = "Differences of runs of the same recording"
+    columns = [quantity, RUN, *entry_columns("value")]
     main = ("position_rmse_m", _GOSPA)
     return Table(
         title,
@@ -175,11 +173,9 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, item in metrics.items():
         if item.multi_object is not None and item.truth is not None:
-            of, m2, overall = (
-                item.multi_object,
-                item.multi_object.gospa,
-                item.truth.overall,
-            )
+            of = item.multi_object
+            m2 = item.multi_object.gospa
+            overall = item.truth.overall
             parts = {
                 part: m2[f"{part}_m2"]
                 for part in ("localisation", "false", "out_of_view", "missed")
@@ -196,7 +192,8 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
             record |= {"mota": of.clear["mota"], "idf1": of.identity["idf1"], **of.hota}
             for name, values in of.others.items():
                 record |= {f"{name}_{key}": value for key, value in values.items()}
-            switches, confirm_s = overall.id_switches, overall.time_to_confirm_s.mean
+            switches = overall.id_switches
+            confirm_s = overall.time_to_confirm_s.mean
             records.append(
                 record | {"id_switches": switches, "time_to_confirm_s": confirm_s}
             )
@@ -344,7 +341,8 @@ def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, item in metrics.items():
         if sensor in item.sensors:
-            mine, nis = item.sensors[sensor], item.consistency.nis[sensor]
+            mine = item.sensors[sensor]
+            nis = item.consistency.nis[sensor]
             record: dict[str, Any] = {"run": label}
             for name, moments in mine.residuals.items():
                 record |= {

@@ -161,7 +161,8 @@ def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
         if fnmatchcase(name, pattern)
     ]:
         values, costs = np.full((2, len(points), len(names), len(seeds)), np.nan)
-        values[at], costs[at] = rows[metric], _cost(rows, metric)
+        values[at] = rows[metric]
+        costs[at] = _cost(rows, metric)
         for point, value, cost in zip(points, values, costs, strict=True):
             valued = np.isfinite(cost).any(axis=1)
             common = np.isfinite(cost[valued]).all(axis=0)

@@ -70,7 +70,8 @@ class Likelihood:
 
     def __init__(self, problem: "Problem", values: FloatArray, free: BoolArray) -> None:
         self._innovations = Innovations(problem.space, values, problem.series)
-        self._start, self._free = values, free
+        self._start = values
+        self._free = free
         named = np.array([bool(name) for _, name in problem.space.names])[free]
         self._prior_log = np.log(problem.prior)[free]
         self._prior_log_std = np.where(named, _PRIOR_LOG_STD, _PRIOR_LOG_STD_OF_SHARES)
@@ -194,7 +195,8 @@ def _expected(evaluation: Evaluation) -> FloatArray:
     """Return the expected information of normal innovations, shape (f, f)."""
     dy, dS = _difference(evaluation.y), _difference(evaluation.S)
     solved = psd_solve(evaluation.S[:1], np.concatenate([dS, dy[..., None]], axis=-1))
-    A, weighted = solved[..., :-1], solved[..., -1]
+    A = solved[..., :-1]
+    weighted = solved[..., -1]
     f = len(dy)
     of_covariances = A.reshape(f, -1) @ A.mT.reshape(f, -1).T
     return symmetrise(
@@ -243,7 +245,8 @@ class Problem:
         values = start.copy()
         likelihood = Likelihood(self, values, free)
         for _ in range(_MAX_LINEARISATIONS):
-            logs, current = np.log(values[free]), likelihood
+            logs = np.log(values[free])
+            current = likelihood
             best = minimize(  # type: ignore[call-overload]  # scipy-stubs lack the callback of two results
                 lambda at, of=current: of.cost(at)[:2],
                 logs,

@@ -142,7 +142,9 @@ class Innovations:
             y = self._y[k] - (H @ x[..., None])[..., 0]
             item = update(P, H, y, R[:, j], self._foreign[k], odds[:, j])
             x, P = x + item.step, item.covariance
-            log_likelihoods[k], ys[k], Ss[k] = item.log_likelihood, y, item.S
+            log_likelihoods[k] = item.log_likelihood
+            ys[k] = y
+            Ss[k] = item.S
             if self._has_assumed[k]:
                 y, H, R_assumed = (array[k] for array in self._assumed)
                 K, _ = kalman_gain(P, np.broadcast_to(H, (b, *H.shape)), R_assumed)
@@ -169,7 +171,9 @@ class Innovations:
             weights = np.square(values[:, : len(parts)])
             Q = rest[block] + np.tensordot(weights, parts[:, block], axes=1)
             return self._F[None, block], np.zeros((1, *self._about[block].shape)), Q
-        x, dt_s, there = self._about[block], self._since_s[block], self._there[block]
+        x = self._about[block]
+        dt_s = self._since_s[block]
+        there = self._there[block]
         models = [self._space.motion_model(row) for row in values]
         moved = np.array([model.predict(x, dt_s) for model in models])
         F = np.array([model.jacobian(x, dt_s) for model in models])

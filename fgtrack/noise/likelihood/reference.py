@@ -59,14 +59,16 @@ def filtered(
     stamp_ns = series.start.stamp_ns
     steps = []
     for k, observation in enumerate(series.observations):
-        measurement, sensor = observation.measurement, observation.sensor
+        measurement = observation.measurement
+        sensor = observation.sensor
         since_s = seconds(measurement.stamp_ns - stamp_ns)
         initial = k < series.num_initial
         about = series.nominal[k] if initial else x
         moved, F, Q = motion.transition(about, since_s)
         predicted = moved + F @ (x - about)
         P = propagated(F, P, Q)
-        here, there = list(observation.measured), list(observation.assumed)
+        here = list(observation.measured)
+        there = list(observation.assumed)
         R = observation.own
         if observation.tuned:
             stds = np.array([by_name[name] for name in observation.parameters])
@@ -82,7 +84,8 @@ def filtered(
             observation.other_errors,
             np.array(by_name[sensor, ""]),
         )
-        after, P = predicted + result.step, result.covariance
+        after = predicted + result.step
+        P = result.covariance
         R_assumed = measurement.R[np.ix_(there, there)]
         if there:
             K, _ = kalman_gain(P, H[there], R_assumed)
@@ -103,7 +106,8 @@ def filtered(
                 result,
             )
         )
-        x, stamp_ns = after.copy(), measurement.stamp_ns
+        x = after.copy()
+        stamp_ns = measurement.stamp_ns
         # Before, the yaw belongs to the nominal trajectory and must not jump.
         if yawed and k + 1 >= series.num_initial:
             x[YAW] = wrap_angle(x[YAW])
@@ -122,7 +126,8 @@ def with_mixed_marked(series: Series, space: NoiseSpace, values: FloatArray) -> 
         [step.update.outlier for step in filtered(series, space, values)]
     )
     stamps_ns = np.array([item.measurement.stamp_ns for item in series.observations])
-    size, margin_ns = min(_WINDOW, len(outlier)), nanoseconds(_MARGIN_S)
+    size = min(_WINDOW, len(outlier))
+    margin_ns = nanoseconds(_MARGIN_S)
     means = np.convolve(outlier, np.full(size, 1.0 / size), mode="valid")
     mixed = np.zeros(len(outlier), dtype=np.bool_)
     for first in np.flatnonzero(means > _MAX_OUTLIERS).tolist():

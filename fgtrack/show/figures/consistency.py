@@ -65,7 +65,9 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             band = chi_square_band(expected * count, count)
             colour = run_styles([one])[one.label].colour
             inside = (mean >= band[0]) & (mean <= band[1])
-            subject, unit, line = "position", "ticks", ""
+            subject = "position"
+            unit = "ticks"
+            line = ""
         else:
             sensor = name.removeprefix("NIS of ")
             colour = SENSORS[sensors.index(sensor) % len(SENSORS)]
@@ -76,7 +78,9 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             length = min(
                 max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values)
             )
-            subject, unit, line = sensor, "detections", f"; line: mean of {length}"
+            subject = sensor
+            unit = "detections"
+            line = f"; line: mean of {length}"
             order = np.argsort(since_ns, kind="stable")
             share = np.full(length, 1.0 / length)
             at_ns, mean, expected = (

@@ -53,7 +53,8 @@ _COLUMN: Mapping[str, Any] = {
 }
 _COLUMN_IN = 5.0
 _UNITS_IN = {"in": 1.0, "cm": 1.0 / 2.54, "mm": 1.0 / 25.4, "pt": 1.0 / 72.27}
-_NARROWEST_IN, _WIDEST_IN = 1.5, 40.0
+_NARROWEST_IN = 1.5
+_WIDEST_IN = 40.0
 # The height is proportional to width^0.6, because texts do not shrink with the figure.
 _FLATTEN = 0.6
 #: Fonts with the same letter widths, for machines without the commercial font.

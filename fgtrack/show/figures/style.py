@@ -100,7 +100,8 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
         return
     more = len(labels) - _MOST_ENTRIES
     if more > 1:
-        handles, labels = handles[:_MOST_ENTRIES], labels[:_MOST_ENTRIES]
+        handles = handles[:_MOST_ENTRIES]
+        labels = labels[:_MOST_ENTRIES]
         labels[-1] += f" ... and {more} more"
     letters = (share * figure.get_figwidth() - _BESIDE_IN) / (
         LETTER * size_in("legend.fontsize")
@@ -204,7 +205,8 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 def png(figure: Figure, dpi: float = 150.0) -> bytes:
     """Return `figure` as a small PNG with 256 colours, without date and version."""
-    full, small = io.BytesIO(), io.BytesIO()
+    full = io.BytesIO()
+    small = io.BytesIO()
     figure.savefig(full, format="png", dpi=dpi)
     picture = Image.open(full).convert("RGB")
     picture.quantize(

@@ -139,7 +139,8 @@ def sweep(
             axes.set_xlabel(words(across))
             axes.tick_params(labelbottom=True)
     first: Axes = grid[0, 0]
-    low, high = means["mean"].min(), means["mean"].max()
+    low = means["mean"].min()
+    high = means["mean"].max()
     if low > 0.0 and high > _LOG_FROM * low:
         first.set_yscale("log")
         log_axis(first.yaxis)
