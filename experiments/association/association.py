@@ -44,7 +44,7 @@ from fgtrack.models.motion import CTRV
 from fgtrack.show.figures.paper import styled
 from fgtrack.show.figures.style import log_axis, save
 from fgtrack.show.palette import PALETTE
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.preprocess import Candidates, Group
 
@@ -183,7 +183,7 @@ def _drawn(
     starts = [initial_state(MOTION, prior) for prior in priors]
     states = [np.array([rng.multivariate_normal(*start) for start in starts])]
     for step_ns in np.diff(stamps_ns).tolist():
-        states.append(drawn(MOTION, states[-1], seconds(step_ns), rng))
+        states.append(draw_states(MOTION, states[-1], seconds(step_ns), rng))
     return np.array(states)
 
 

@@ -26,7 +26,7 @@ from fgtrack.evaluation.intervals import Estimate, average, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 HUBER = RobustLoss("huber", 1.5)
@@ -186,7 +186,7 @@ def scene(world: World, rng: np.random.Generator) -> Drawn:
     for since_ns, sensor in plan:
         dt_s = (since_ns - last_ns) / NS_PER_S
         if dt_s > 0.0:
-            x = drawn(world.motion, x, dt_s, rng)
+            x = draw_states(world.motion, x, dt_s, rng)
             last_ns = since_ns
         truth[since_ns] = x
         if sensor is not None:

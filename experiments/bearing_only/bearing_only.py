@@ -27,7 +27,7 @@ from fgtrack.estimation.registry import ESTIMATORS, estimator
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 FIRST_BEARING_RAD = np.deg2rad(10.0)
@@ -139,7 +139,7 @@ def pursuit(world: World, rng: np.random.Generator, last_s: float) -> Pursuit:
         np.concatenate([position, world.velocity_std_mps * rng.standard_normal(2)])
     ]
     for _ in range(steps - 1):
-        truth.append(drawn(world.motion, truth[-1], world.step_s, rng))
+        truth.append(draw_states(world.motion, truth[-1], world.step_s, rng))
     R = np.array([[world.bearing_std_rad**2]])
     measurements = []
     for k, (place, state) in enumerate(zip(world.observer(steps), truth, strict=True)):

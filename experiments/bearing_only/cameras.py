@@ -28,7 +28,7 @@ from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.scores.lagged import lag_metrics
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 MOTION = CTRV(0.01, 0.001, 0.5, 0.01)
 STARTS = np.array(
@@ -116,7 +116,7 @@ def _sensed(
                 [Detection(bearing_rad=value) for value in bearings.tolist()],
                 "sensor",
             )
-        states = drawn(MOTION, states, PERIOD_S, rng)
+        states = draw_states(MOTION, states, PERIOD_S, rng)
 
 
 def _list(

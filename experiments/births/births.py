@@ -22,7 +22,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05
@@ -71,7 +71,7 @@ def errors(label: str, rng: np.random.Generator) -> FloatArray:
     found = []
     for k in range(1, NUM_STEPS + 1):
         stamp_ns = START_NS + round(k * STEP_S * NS_PER_S)
-        x = drawn(TRUTH, x, STEP_S, rng)
+        x = draw_states(TRUTH, x, STEP_S, rng)
         estimator.update(
             Measurement(stamp_ns, model, x[:2] + STD_M * rng.standard_normal(2), R)
         )

@@ -36,7 +36,7 @@ from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.show.figures.paper import styled
 from fgtrack.show.figures.style import GREY, WRONG, save
 from fgtrack.show.palette import style_of
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 POOR_PERIOD_S, GOOD_PERIOD_S, GOOD_PHASE_S = 0.05, 0.1, 0.025
@@ -183,7 +183,7 @@ def chains(
         + rng.standard_normal((runs, motion.dim)) @ np.linalg.cholesky(covariance).T
     ]
     for step_ns in np.diff(stamps_ns).tolist():
-        states.append(drawn(motion, states[-1], seconds(step_ns), rng))
+        states.append(draw_states(motion, states[-1], seconds(step_ns), rng))
     return np.stack(states, axis=1)
 
 

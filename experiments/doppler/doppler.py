@@ -26,7 +26,7 @@ from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.evaluation.intervals import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 MOTION = CTRV()
 STEP_S, DURATION_S, SETTLED_S = 0.1, 5.0, 1.0
@@ -136,7 +136,7 @@ def driven(x: FloatArray, rng: np.random.Generator) -> Iterator[tuple[int, Float
     """Stamps and true states of an object that starts at `x` (5,)."""
     for k in range(round(DURATION_S / STEP_S)):
         if k:
-            x = drawn(MOTION, x, STEP_S, rng)
+            x = draw_states(MOTION, x, STEP_S, rng)
         yield round(k * STEP_S * 1e9), x
 
 

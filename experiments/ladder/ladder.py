@@ -40,7 +40,7 @@ from fgtrack.models.motion import CV
 from fgtrack.show.figures.paper import styled
 from fgtrack.show.figures.style import WRONG, log_axis, save
 from fgtrack.show.palette import styles
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 MOTION = CV(velocity_density_m2ps3=5.0)
 POSITION = measurement_model(("x_m", "y_m"), MOTION)
@@ -119,7 +119,7 @@ def arrivals(
     late_s = NUM_STEPS * STEP_S - delay_s(lag)
     now_s, measurements, late = 0.0, [], None
     for stamp_s, std_m in sorted((stamps_s | {late_s: LATE_STD_M}).items()):
-        x = drawn(MOTION, x, stamp_s - now_s, rng)
+        x = draw_states(MOTION, x, stamp_s - now_s, rng)
         z = x[:2] + std_m * rng.standard_normal(2)
         measurement = Measurement(
             nanoseconds(stamp_s), POSITION, z, std_m**2 * np.eye(2)

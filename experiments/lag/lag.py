@@ -21,7 +21,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.025
@@ -43,7 +43,7 @@ class Run:
         states = [self.start + PRIOR_STD * rng.standard_normal(5)]
         received: list[tuple[float, int, Measurement]] = []
         for k in range(1, round(duration_s / STEP_S) + 1):
-            states.append(drawn(MOTION, states[-1], STEP_S, rng))
+            states.append(draw_states(MOTION, states[-1], STEP_S, rng))
             phase, delay_s, std = SENSORS[k % 2]
             model = measurement_model(tuple(std), MOTION)
             stds = np.array(list(std.values()))

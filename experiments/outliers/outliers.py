@@ -22,7 +22,7 @@ from fgtrack.evaluation.intervals import paired
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05
@@ -91,7 +91,7 @@ def rmse_m(label: str, share: float, seed: int, run: int) -> float:
     waiting: list[tuple[int, Measurement]] = []
     squared_m2 = np.empty(NUM_STEPS)
     for k in range(NUM_STEPS):
-        x = drawn(MOTION, x, STEP_S, rng)
+        x = draw_states(MOTION, x, STEP_S, rng)
         std_m = STD_M * (FACTOR if rng.random() < share else 1.0)
         z = x[:2] + std_m * rng.standard_normal(2)
         now_ns = START_NS + round((k + 1) * STEP_S * NS_PER_S)

@@ -1,4 +1,4 @@
-"""The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
+"""The run folder `fgtrack-run/1`, through which the evaluation gets the tracker's results: writer, reader, columns."""
 
 from fgtrack.runs.memory import MemoryRun
 from fgtrack.runs.reader import Columns, Run, load_run

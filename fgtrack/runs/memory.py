@@ -1,24 +1,24 @@
-"""Keeps a run in memory: what `load_run` would give of the folder that `RunWriter` writes, without the files."""
+"""Keeps a run in memory, with the contents of the run folder but without files."""
 
 import hashlib
 from collections.abc import Sequence
 from functools import cached_property
 
-from fgtrack.runs.reader import Run, parsed
+from fgtrack.runs.reader import Run, parse_csv
 from fgtrack.runs.rows import Row, text, text_header
 from fgtrack.runs.schema import COLUMNS
 from fgtrack.runs.sink import RunSink
 
 
 class MemoryRun(RunSink):
-    """Takes what `RunWriter` takes; `run` is the run so far."""
+    """Sink that keeps the run in memory; `run` equals the run that `load_run` would read from a run folder."""
 
     @property
     def run(self) -> Run:
-        """The run; it has no path."""
+        """The run up to now; its path is None."""
         self._append_rows()
         tables = {
-            table: parsed(table, content) for table, content in self._files.items()
+            table: parse_csv(table, content) for table, content in self._files.items()
         }
         return Run(None, dict(self._meta), self._config_text, tables)
 

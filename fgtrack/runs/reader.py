@@ -1,4 +1,4 @@
-"""Reads a run folder into columns."""
+"""Reads a run folder; each table becomes columns."""
 
 import json
 import math
@@ -41,8 +41,10 @@ if TYPE_CHECKING:  # takes half a second to import
 
 
 class Columns(dict[str, Column]):
-    """Columns by name as NumPy arrays, each of shape (rows,) and read-only; `len` is the number of columns.
-    An empty cell, and a number beyond 1e60, is NaN in a float column; an empty one is `NO_TRACK` in an integer one.
+    """Columns of a table by name: read-only NumPy arrays of shape (rows,); `len` is the number of columns.
+
+    In a float column, an empty cell and a number beyond 1e60 are NaN. In an integer
+    column, an empty cell is `NO_TRACK`.
     """
 
     def __init__(self, columns: Mapping[str, Column]) -> None:
@@ -56,7 +58,7 @@ class Columns(dict[str, Column]):
         return len(next(iter(self.values()), ()))
 
     def equals(self, other: "Columns") -> bool:
-        """True if both have the same columns, to the bit; NaN equals NaN."""
+        """True if both tables have the same columns, equal to the bit; NaN equals NaN."""
         return list(self) == list(other) and all(
             np.array_equal(
                 self[name], other[name], equal_nan=column_type(name) is float
@@ -65,12 +67,12 @@ class Columns(dict[str, Column]):
         )
 
     def where(self, rows: BoolArray | IntArray) -> "Columns":
-        """The rows where a mask, shape (rows,), is true, or those with these indices."""
+        """Return the rows selected by a mask, shape (rows,), or by indices."""
         return Columns({name: values[rows] for name, values in self.items()})
 
 
 def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
-    """A table of a run as a pandas DataFrame."""
+    """Property of a run: the table as a pandas DataFrame, with the docstring `doc`."""
 
     def made(run: "Run") -> "DataFrame":
         import pandas
@@ -83,16 +85,16 @@ def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A run as evaluation sees it."""
+    """The tables, the meta data and the configuration of a run."""
 
     path: Path | None
     """Folder of the run; None for a run in memory."""
     meta: Mapping[str, Any]
-    """Content of meta.json; JSON values."""
+    """JSON values of meta.json."""
     config_text: str
     """Text of config.yaml."""
     tables: Mapping[str, Columns]
-    """The tables by name as NumPy columns; those left out have no rows."""
+    """Columns of every table by name; a table without a file has no rows."""
 
     def __post_init__(self) -> None:
         empty = {
@@ -103,30 +105,35 @@ class Run:
 
     tracks = _frame("tracks", "States of every track at every tick.")
     updates = _frame(
-        "updates", "A row per detection: its disposition, track, NIS and innovation."
+        "updates",
+        "A row for each detection: its disposition, track, NIS and innovation.",
     )
-    smoothed = _frame("smoothed", "Final states, and lagged ones of the first lag.")
+    smoothed = _frame("smoothed", "Final states, and the lagged states of one lag.")
     lagged = _frame("lagged", "Lagged states of every lag.")
     timing = _frame(
         "timing",
-        "A row per tick: its time, processing time, numbers of tracks and detections.",
+        "A row for each tick: its time, processing time, numbers of tracks and detections.",
     )
     truth = _frame("truth", "True objects.")
     ignored = _frame(
-        "ignored", "Objects and regions at which a track is neither right nor false."
+        "ignored",
+        "Objects and regions that the evaluation ignores: tracks there are neither right nor false.",
     )
     ego = _frame("ego", "States of the ego, in order of receipt.")
     objects = _frame(
         "objects",
-        "Class and size of the objects of tracks, where detections have them.",
+        "Class and size of the tracks' objects, if detections report them.",
     )
     detections = _frame(
-        "detections", "Detections in order of receipt, a row for each of `updates`."
+        "detections", "Detections in order of receipt, a row for each row of `updates`."
     )
 
     def __repr__(self) -> str:
-        meta, updates, truth = self.meta, self.tables["updates"], self.tables["truth"]
-        tracks, now_ns = self.tables["tracks"], self.tables["timing"]["now_ns"].tolist()
+        meta = self.meta
+        updates = self.tables["updates"]
+        truth = self.tables["truth"]
+        tracks = self.tables["tracks"]
+        now_ns = self.tables["timing"]["now_ns"].tolist()
         counts = Counter(updates["disposition"].tolist())
         length_s = (now_ns[-1] - now_ns[0]) / NS_PER_S if now_ns else 0.0
         lines = {
@@ -157,15 +164,15 @@ class Run:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Values of config.yaml. Raises `DataError` where it is not a YAML mapping, or not that of a run."""
+        """Values of config.yaml; raises `DataError` if the file is not YAML, or contains no mapping."""
         try:
-            config = _parsed(self.config_text)
+            config = _cached_yaml(self.config_text)
         except YAMLError as error:
             raise DataError(
                 f"{self.config_path}: is not YAML, repeat the run"
             ) from error
         if not isinstance(config, dict | None):
-            raise DataError(f"{self.config_path}: holds no settings, repeat the run")
+            raise DataError(f"{self.config_path}: has no settings, repeat the run")
         return config or {}
 
     @property
@@ -175,7 +182,7 @@ class Run:
 
     @property
     def recording(self) -> Path | None:
-        """Path, relative to the run folder or as given, of the run's recording; None where there is no such file."""
+        """Path of the recording, relative to the run folder or as given; None if it does not exist."""
         source = self.meta.get("input") or {}
         given = [source["path"]] if source.get("path") else []
         if self.path is not None and source.get("path_from_run"):
@@ -186,11 +193,11 @@ class Run:
         )
 
     def with_tables(self, **tables: Columns) -> "Run":
-        """The run with these tables, by name, instead of its own."""
+        """Return the run with these tables, by name, instead of its own."""
         return replace(self, tables={**self.tables, **tables})
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:
-        """Write the run folder `path`. Raises `CallError` where something is there, as `RunWriter`."""
+        """Write the run folder `path`; raises `CallError` if something exists there, as `RunWriter`."""
         meta = dict(self.meta)
         if self.recording is not None:
             meta["input"] = {
@@ -204,12 +211,15 @@ class Run:
             writer.finish(meta)
 
 
-_parsed = lru_cache(maxsize=64)(safe_yaml)
-"""YAML values of a text. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
+_cached_yaml = lru_cache(maxsize=64)(safe_yaml)
+"""Cached YAML values of a text. Parsing takes longer than evaluating a run of 20 s, and sweeps repeat the text."""
 
 
 def load_run(path: Path | str) -> Run:
-    """Read the run folder `path`, without a half-written last row; `DataError` if a file is missing or damaged."""
+    """Read the run folder `path`, without a half-written last row.
+
+    Raises `DataError` if a file is missing or damaged.
+    """
     path = Path(path)
     file, config = path / "meta.json", path / "config.yaml"
     try:
@@ -240,32 +250,35 @@ def load_run(path: Path | str) -> Run:
 
 
 def _read_table(path: Path, table: str, complete: bool) -> Columns:
-    if (
-        table in OPTIONAL_TABLES or not complete
-    ) and not path.exists():  # or killed while it was begun
-        return parsed(table, text_header(table))
+    # A run that was killed at its beginning lacks tables.
+    if (table in OPTIONAL_TABLES or not complete) and not path.exists():
+        return parse_csv(table, text_header(table))
     try:
         with open_file(path) as file:
             content = file.read()
         if complete and (not content.endswith(b"\n") or content.endswith(b"\n\n")):
             raise DataError(f"{path}: breaks off in its last row, repeat the run")
-        return parsed(table, content[: content.rfind(b"\n") + 1] or text_header(table))
+        return parse_csv(
+            table, content[: content.rfind(b"\n") + 1] or text_header(table)
+        )
     except (OSError, ValueError, OverflowError) as error:
         raise DataError(
             f"{path}: cannot be read ({one_line(error)}), repeat the run"
         ) from error
 
 
-def parsed(table: str, content: bytes | bytearray) -> Columns:
-    """The table whose CSV file has this `content`. Raises `ValueError` for another one."""
-    names, text = COLUMNS[table], TextIOWrapper(BytesIO(content), newline="")
+def parse_csv(table: str, content: bytes | bytearray) -> Columns:
+    """Return the columns of a table from the content of its CSV file; raises `ValueError` for other content."""
+    names = COLUMNS[table]
+    text = TextIOWrapper(BytesIO(content), newline="")
     written = tuple(text.readline().rstrip("\n").split(","))
     if (
         tuple(name for name in names if name in written or name not in ADDED_COLUMNS)
         != written
     ):
         raise ValueError(f"the columns must be {','.join(names)}")
-    with catch_warnings(action="ignore", category=UserWarning):  # of no rows
+    # NumPy warns about a file without rows.
+    with catch_warnings(action="ignore", category=UserWarning):
         cells = np.loadtxt(
             text,
             dtype=[(name, _TYPES[column_type(name)]) for name in written],
@@ -275,11 +288,12 @@ def parsed(table: str, content: bytes | bytearray) -> Columns:
             converters=dict(enumerate(map(_converter, written))),
             ndmin=1,
         )
+    # Runs of fgtrack 0.2 lack these columns.
     added = {
         name: [ADDED_COLUMNS[name]] * len(cells)
         for name in names
         if name not in written
-    }  # of runs of 0.2
+    }
     return Columns(
         {
             name: column(name, added[name] if name in added else cells[name])
@@ -292,7 +306,7 @@ _TYPES = {str: object, int: np.int64, float: np.float64}
 
 
 def _converter(name: str) -> Callable[[str], str | int | float]:
-    """Return what reads a cell of the column `name`."""
+    """Return the function that converts a cell of the column `name`."""
     if column_type(name) is float:
         return lambda cell: float(cell) if cell else math.nan
     return (
@@ -303,7 +317,7 @@ def _converter(name: str) -> Callable[[str], str | int | float]:
 
 
 def _lines(table: str, columns: Columns, is_scored: bool) -> str:
-    """Lines of the CSV file of `table`, floats with 17 significant digits."""
+    """Return the columns as lines of the table's CSV file; floats have 17 significant digits."""
     import pandas
 
     frame = pandas.DataFrame(columns)

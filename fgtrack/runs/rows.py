@@ -1,4 +1,4 @@
-"""The cells of every table of a run, and their text; None where a cell is empty."""
+"""Rows of every table of a run, and their CSV text; an empty cell is None."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
@@ -22,7 +22,7 @@ from fgtrack.runs.schema import COLUMNS, COVARIANCE_STATES
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
-#: Indices of the columns that hold whatever the input calls things.
+#: Indices of the columns with names from the input, which may need quotes.
 _QUOTED = {
     table: [
         index
@@ -39,9 +39,12 @@ def rows(
     num_detections: int,
     smoothed_lag_s: float | None,
 ) -> Iterator[tuple[str, list[Row]]]:
-    """The rows of one tick by table; lagged states only of the tracks that the tick reports.
-    `process_ns` is the wall time of the tick, `num_detections` the number of detections that it received. The states of
-    `smoothed_lag_s` are in `smoothed` with the final ones; those of every lag are in `lagged`.
+    """Yield the rows of one tick, table by table.
+
+    `process_ns` is the wall time of the tick, `num_detections` the number of detections
+    that it received. `smoothed` gets the final states and the lagged states with the
+    lag `smoothed_lag_s`; `lagged` gets the lagged states of every lag. Lagged states of
+    tracks that the tick does not report are left out.
     """
     tick = (report.tick, report.now_ns)
     yield "tracks", [_track_row(tick, track) for track in report.tracks]
@@ -72,10 +75,8 @@ def rows(
 
 
 def _track_row(tick: tuple[int, int], track: TrackReport) -> Row:
-    cells, ids = (
-        _state_cells(track.state),
-        (track.state.stamp_ns, track.track_id, track.status.value),
-    )
+    cells = _state_cells(track.state)
+    ids = (track.state.stamp_ns, track.track_id, track.status.value)
     return (
         *tick,
         *ids,
@@ -99,7 +100,7 @@ def _update_row(tick: int, update: UpdateRecord) -> Row:
 
 
 def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
-    """Rows of `smoothed`."""
+    """Return the rows of `smoothed` for final and lagged states."""
     return [
         (
             row.track_id,
@@ -112,7 +113,7 @@ def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
 
 
 def detection_rows(message: DetectionList) -> list[Row]:
-    """Rows of `detections`: what `message` contains of every object, in its own frame."""
+    """Return the rows of `detections`: the fields of every object of `message`, in the frame of `message`."""
     cells: list[Row] = []
     for index, item in enumerate(message.objects):
         stamp_ns = message.stamp_ns if item.stamp_ns is None else item.stamp_ns
@@ -134,7 +135,7 @@ def detection_rows(message: DetectionList) -> list[Row]:
 
 
 def text(table: str, cells: Sequence[Row]) -> str:
-    """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
+    """Return `cells` as lines of the table's CSV file; floats have 17 significant digits."""
     for index in _QUOTED[table]:
         cells = [
             (*row[:index], _quoted(row[index]), *row[index + 1 :]) for row in cells
@@ -143,7 +144,7 @@ def text(table: str, cells: Sequence[Row]) -> str:
 
 
 def text_header(table: str, is_scored: bool = True) -> bytes:
-    """First line of the CSV file of `table`; `is_scored` is that of `RunSink`."""
+    """Return the first line of the table's CSV file; `is_scored` as in `RunSink`."""
     names = COLUMNS[table] if is_scored or table != "tracks" else COLUMNS[table][:-1]
     return (",".join(names) + "\n").encode()
 
@@ -161,7 +162,7 @@ def _format(kind: type) -> str:
 
 @lru_cache
 def _quoted(name: Cell) -> Cell:
-    """`name` as a CSV cell."""
+    """Return `name` as a CSV cell, in quotes if necessary."""
     if name is None:
         return None
     name = str(name)
@@ -169,7 +170,7 @@ def _quoted(name: Cell) -> Cell:
 
 
 def _state_cells(state: TrackState) -> Row:
-    """Mean and upper triangle of the covariance; None where the model has no such state."""
+    """Return the cells of the mean and of the covariance's upper triangle; None for states that the model lacks."""
     mean = state.mean.tolist()
     entries: list[Cell] = [*state.covariance.ravel().tolist(), None]
     return (
@@ -181,15 +182,18 @@ def _state_cells(state: TrackState) -> Row:
 
 @lru_cache
 def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
-    """Return a function that picks the cells of the covariance of `size` states, row by row, and a final None."""
+    """Return a function that selects the upper triangle from the row-major covariance of `size` states.
+
+    The last entry of its argument must be None; it stands for states that the model
+    lacks.
+    """
     kept = range(len(COVARIANCE_STATES))
     indices = [i * size + j if j < size else -1 for i in kept for j in kept[i:]]
-    picked: Callable[[list[Cell]], Any] = itemgetter(
-        *indices
-    )  # Any: a tuple, as there are several indices
-    return picked
+    # Any: a tuple, because there are several indices.
+    select: Callable[[list[Cell]], Any] = itemgetter(*indices)
+    return select
 
 
 state_cells: Callable[[EgoState | TruthState], Row] = attrgetter(*STATE_NAMES)
-"""Cells of the states of the ego or of truth."""
+"""Returns the state cells of the ego or of a true object."""
 _values = attrgetter(*MEASURABLE, *DESCRIBING)

@@ -1,4 +1,4 @@
-"""The layout of a run folder `fgtrack-run/1`: its tables and their columns."""
+"""Tables of a run folder `fgtrack-run/1`, and their columns."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,15 +10,15 @@ import numpy.typing as npt
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 
 RUN_FORMAT = "fgtrack-run/1"
-#: States whose covariance is written.
+#: States of the covariance in the tables.
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
-#: Upper triangle of the covariance, row by row.
+#: Columns of the covariance's upper triangle, row by row.
 COVARIANCE_COLUMNS = tuple(
     f"p_{a}_{b}" for i, a in enumerate(COVARIANCE_STATES) for b in COVARIANCE_STATES[i:]
 )
-#: Last column of tracks.csv, the existence probability, where the lifecycle gives one.
+#: Last column of tracks.csv: the existence probability, if the lifecycle estimates it.
 SCORE = "score"
-#: Columns of every table of a run folder, in their order.
+#: Columns of each table, in the order of the file.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "tracks": (
         *("tick", "now_ns", "stamp_ns", "track_id", "status"),
@@ -73,7 +73,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *DESCRIBING,
     ),
 }
-#: Tables that are written only when there is something to write.
+#: Tables without a file if they have no rows.
 OPTIONAL_TABLES = (
     "smoothed",
     "lagged",
@@ -84,12 +84,12 @@ OPTIONAL_TABLES = (
     "detections",
 )
 ADDED_COLUMNS: Mapping[str, str | float] = {"id": "", SCORE: math.nan}
-"""Columns that older runs may lack, and their cells then."""
+"""Columns that older runs lack, and the value of their cells."""
 NO_TRACK = -1
-"""Track id of an update that belongs to no track."""
+"""Track id of an update without a track."""
 
-# A column holds floats, integers or text, as its name specifies; which its reader specifies.
 Column = npt.NDArray[Any]
+"""Values of a column, shape (rows,): floats, integers or text, depending on the name (`column_type`)."""
 _TEXT = frozenset(
     {
         "status",
@@ -116,7 +116,8 @@ _INTEGERS = frozenset(
         *("index", "num_measured", "num_tracks", "num_detections"),
     }
 )
-_LARGEST = 1e60  # its square is a number; more is no measurement, and no state
+#: Largest number of a column, whose square is finite; no measurement and no state exceeds it.
+_LARGEST = 1e60
 
 
 def column_type(name: str) -> type:
@@ -125,7 +126,10 @@ def column_type(name: str) -> type:
 
 
 def column(name: str, cells: Sequence[Any] | Column) -> Column:
-    """The column `name` of `cells`, shape (rows,); None is an empty cell, and a number beyond 1e60 is NaN."""
+    """Return the column `name`, shape (rows,), from `cells`.
+
+    None is an empty cell, and a number beyond 1e60 becomes NaN.
+    """
     kind = column_type(name)
     if kind is str:
         return np.array(["" if cell is None else cell for cell in cells], dtype=np.str_)

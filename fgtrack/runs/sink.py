@@ -1,4 +1,4 @@
-"""Sinks of a run: rows of the tables, counts of the dispositions, the meta data."""
+"""Base of the sinks of a run, which collect table rows, counts of the dispositions, and meta data."""
 
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
@@ -20,12 +20,15 @@ from fgtrack.runs.rows import Row, detection_rows, rows, smoothed_rows, state_ce
 from fgtrack.runs.schema import COLUMNS, RUN_FORMAT
 
 PERIOD_S = 0.2
-"""Rows are appended together after so much wall time: to write each by itself takes as long as to format it."""
+"""Wall time between two writes of rows. Writing each row by itself would take as long as formatting it."""
 
 
 class RunSink(ABC):
-    """Takes a run tick by tick; where the rows go, its subclasses decide. `meta` is that of `meta.json` at the start.
-    The states of the lag `smoothed_lag_s` go to `smoothed` with the final ones; `lagged` gets those of every lag.
+    """Sink of a run: receives the results of a replay tick by tick. Subclasses store the rows.
+
+    `meta` is the content of `meta.json` at the start. The table `smoothed` gets the
+    final states and the lagged states with the lag `smoothed_lag_s`; `lagged` gets the
+    lagged states of every lag.
     """
 
     def __init__(
@@ -42,29 +45,24 @@ class RunSink(ABC):
         }
         self._smoothed_lag_s = smoothed_lag_s
         self._counts: dict[str, Counter[Disposition]] = defaultdict(Counter)
-        self._out_of_bounds: dict[str, Counter[str]] = defaultdict(
-            Counter
-        )  # by setting
-        self._left_out: dict[str, Counter[str]] = defaultdict(
-            Counter
-        )  # by the reader and its settings
-        self._objects: dict[
-            int, ObjectReport
-        ] = {}  # the last word on tracks that have not ended
-        self._rows: dict[str, list[Row]] = {
-            table: [] for table in COLUMNS
-        }  # not yet appended
+        # Counts by sensor and excluding setting: of the tracker, and of the reader.
+        self._out_of_bounds: dict[str, Counter[str]] = defaultdict(Counter)
+        self._left_out: dict[str, Counter[str]] = defaultdict(Counter)
+        # Newest reports on the objects of tracks that have not ended.
+        self._objects: dict[int, ObjectReport] = {}
+        # Rows that are not appended yet.
+        self._rows: dict[str, list[Row]] = {table: [] for table in COLUMNS}
         self._due_s = 0.0
 
     @property
     def is_scored(self) -> bool:
-        """True if tracks have existence probabilities: a column of `tracks`, which others lack."""
+        """True if tracks have existence probabilities; otherwise `tracks` lacks this column."""
         return bool(self._meta.get("is_scored"))
 
     def write_tick(
         self, report: TickReport, process_ns: int, num_detections: int
     ) -> None:
-        """Take all rows of one tick, see `rows`; those of the first tick are appended immediately."""
+        """Add the rows of one tick, as in `rows`; the rows of the first tick are appended immediately."""
         for record in report.updates:
             self._counts[record.sensor][record.disposition] += 1
             if record.reason is not None:
@@ -87,11 +85,11 @@ class RunSink(ABC):
             self._append_rows()
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
-        """Take rows of `smoothed`; the end of a run may have none."""
+        """Add rows of `smoothed`, which may be none."""
         self._rows["smoothed"] += smoothed_rows(reports)
 
     def write_truth(self, truth: TruthState) -> None:
-        """Take a row of `truth` or `ignored`."""
+        """Add a row of `truth`, or of `ignored` for an ignored object."""
         if truth.ignored:
             outline = (
                 None
@@ -113,11 +111,11 @@ class RunSink(ABC):
             )
 
     def write_ego(self, ego: EgoState) -> None:
-        """Take a row of `ego`."""
+        """Add a row of `ego`."""
         self._rows["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
 
     def write_detections(self, message: DetectionList) -> None:
-        """Take the rows of `detections`."""
+        """Add the rows of `detections`, and count the objects that the reader left out."""
         self._rows["detections"] += detection_rows(message)
         if message.origin_deg is not None:
             self._meta.setdefault(
@@ -127,7 +125,7 @@ class RunSink(ABC):
             self._left_out[message.sensor].update(message.left_out)
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
-        """Complete the run with `meta`, the counts per sensor and the digest; return the content of `meta.json`."""
+        """Complete the run with `meta`, the counts by sensor and the digest; return the content of `meta.json`."""
         self._end_objects(set())
         self._append_rows()
         counts = {
@@ -150,7 +148,7 @@ class RunSink(ABC):
         return dict(self._meta)
 
     def _end_objects(self, alive: Set[int]) -> None:
-        """Take rows of `objects` of tracks that are not `alive` any more."""
+        """Add rows of `objects` for tracks that have ended: those not in `alive`."""
         ended = sorted(self._objects.keys() - alive)
         self._rows["objects"] += [
             (track_id, *astuple(self._objects.pop(track_id))) for track_id in ended
@@ -169,7 +167,7 @@ class RunSink(ABC):
 
     @abstractmethod
     def _digest(self) -> str:
-        """SHA-256 of the bytes of tracks.csv and then updates.csv, in hex."""
+        """SHA-256 of the bytes of tracks.csv followed by updates.csv, in hex."""
 
 
 def _by_reason(counts: Mapping[str, Counter[str]]) -> dict[str, dict[str, int]]:

@@ -1,4 +1,4 @@
-"""Writes a run folder as the run goes."""
+"""Writes a run folder while the run proceeds."""
 
 import hashlib
 import json
@@ -19,15 +19,20 @@ from fgtrack.runs.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.runs.sink import RunSink
 
 LARGEST_META_MB = 16.0
-"""Largest meta.json and config.yaml, which have some kB."""
-_META, _STAGE = "meta.json", "new.part"
+"""Largest meta.json or config.yaml that is read; both normally have some kB."""
+_META = "meta.json"
+#: Folder of a new run inside the folder of an older run.
+_STAGE = "new.part"
 _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", _META)
 
 
 class RunWriter(RunSink):
-    """Writes the run folder `path`, which is locked until the writer is closed; a context manager.
-    Every tick reaches the files within 0.2 s: a killed run leaves readable files and a `meta.json` with
-    `"complete": false`. An older run stays until `finish`: the new one grows in `new.part` beside it. Other files stay.
+    """Context manager that writes the run folder `path`, and keeps the folder locked until it is closed.
+
+    The rows of a tick are in the files within 0.2 s. A killed run leaves readable
+    files, and a `meta.json` with `"complete": false`. An older run stays until
+    `finish`: the new run is written into the subfolder `new.part`. Other files in the
+    folder stay.
     """
 
     def __init__(
@@ -40,12 +45,12 @@ class RunWriter(RunSink):
     ) -> None:
         super().__init__(config_text, meta, smoothed_lag_s)
         self.path = Path(path)
-        self._folder: Path | None = None  # where the files are, once there are any
+        self._folder: Path | None = None  # folder of the files, after the first tick
         self._files: dict[str, BufferedWriter] = {}
-        with ExitStack() as claim:
-            claim.enter_context(locked_folder(self.path))
+        with ExitStack() as stack:
+            stack.enter_context(locked_folder(self.path))
             check_run(self.path, overwrite)
-            self._open = claim.pop_all()
+            self._open = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -57,18 +62,17 @@ class RunWriter(RunSink):
         traceback: TracebackType | None,
     ) -> None:
         self.close()
-        if isinstance(
-            error, Exception
-        ):  # an interrupt leaves the beginning, as a kill does
+        # An interrupt leaves the incomplete run, like a kill.
+        if isinstance(error, Exception):
             shutil.rmtree(self.path / _STAGE, ignore_errors=True)
 
     def close(self) -> None:
-        """Close the tables and unlock the folder; without `finish` before, the run stays marked as incomplete."""
-        with suppress(OSError):  # of a full disk, reported when it was written
+        """Close the tables and unlock the folder; without a `finish` before, the run stays incomplete."""
+        with suppress(OSError):  # a full disk was reported at the write
             self._open.close()
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
-        """Complete the run, see `RunSink`, and replace an older one."""
+        """Complete the run as `RunSink.finish`, and replace an older run."""
         folder = self._begin()
         finished = super().finish(meta)
         self._write_meta(folder)
@@ -80,9 +84,8 @@ class RunWriter(RunSink):
         return finished
 
     def _replace(self, folder: Path) -> None:
-        (self.path / _META).unlink(
-            missing_ok=True
-        )  # until both are renamed there is no run
+        # Without meta.json, which is moved last, the folder is no run.
+        (self.path / _META).unlink(missing_ok=True)
         for name in _FILES:
             if (folder / name).exists():
                 os.replace(folder / name, self.path / name)
@@ -108,19 +111,18 @@ class RunWriter(RunSink):
             raise write_error(folder / f"{table}.csv", error) from error
 
     def _begin(self) -> Path:
-        """Make the files, with the first tick: a run that fails before leaves nothing."""
+        """Create the files at the first call, with the first tick; a run that fails earlier leaves nothing."""
         if self._folder is None:
             folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
             if folder != self.path:
-                shutil.rmtree(folder, ignore_errors=True)  # of a killed command
+                shutil.rmtree(folder, ignore_errors=True)  # left by a killed command
                 try:
                     folder.mkdir()
                 except OSError as error:
                     raise write_error(self.path, error) from error
             self._folder = folder
-            self._write_meta(
-                folder
-            )  # the first, so that a folder with a table is known as a run
+            # meta.json is the first file, so a folder with a table is recognised as a run.
+            self._write_meta(folder)
             write_file(folder / "config.yaml", self._config_text)
             for table in COLUMNS.keys() - OPTIONAL_TABLES:
                 self.write_rows(table, "")
@@ -134,26 +136,26 @@ class RunWriter(RunSink):
 
 
 def check_run(path: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `RunWriter` would for what is at `path`."""
+    """Raise `CallError` if `RunWriter` may not write to `path`."""
     check_output(path, overwrite, is_run_folder, "a run folder")
 
 
 def path_from_run(origin: str, folder: Path) -> str | None:
-    """The path `origin` relative to the run folder `folder`; None if nothing is there."""
+    """Return the path `origin` relative to the run folder `folder`; None if `origin` does not exist."""
     if not origin or not Path(origin).exists():
         return None
     return os.path.relpath(os.path.realpath(origin), os.path.realpath(folder))
 
 
 def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
-    """Write `metrics` as metrics.json into the run folder `path`, whole or not at all."""
+    """Write `metrics` as metrics.json into the run folder `path`, completely or not at all."""
     write_file(
         path / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n"
     )
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of the bytes of tracks.csv and then updates.csv of the run folder `path`, in hex."""
+    """SHA-256 of the bytes of tracks.csv followed by updates.csv in the run folder `path`, in hex."""
     sha = hashlib.sha256()
     for name in ("tracks.csv", "updates.csv"):
         with open_file(path / name) as file:
@@ -163,7 +165,7 @@ def digest(path: Path) -> str:
 
 
 def is_run_folder(path: Path) -> bool:
-    """True if `path` holds a run, or one that was to replace it: a `meta.json` that names the format."""
+    """True if `path` contains a run, or an incomplete replacement: a `meta.json` with the format."""
     for file in (path / _META, path / _STAGE / _META):
         with suppress(DataError, LookupError, TypeError, ValueError, RecursionError):
             if json.loads(read_whole(file, LARGEST_META_MB))["format"] == RUN_FORMAT:

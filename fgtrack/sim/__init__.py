@@ -1,1 +1,1 @@
-"""The simulator: vehicles on a track or in the open, what sensors see of them, and how late it arrives."""
+"""The simulator: vehicles on a track or in the open, their detections by sensors, and the delays of all messages."""

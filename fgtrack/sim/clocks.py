@@ -1,6 +1,7 @@
-"""Errors of the stamps that a sensor reports: error = reported stamp - the time at which it measured.
+"""Errors of the stamps that a sensor reports: error = reported stamp - time of measurement.
 
-A sensor has a list of clock models; each reads what the one before it reported.
+A sensor has a list of clock models. Each model changes the stamps that the previous
+model reported.
 """
 
 from collections.abc import Sequence
@@ -13,30 +14,31 @@ from fgtrack.core.settings import settings
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import IntArray
 
-_LARGEST_ERROR_S = 86_400.0  # a day
+#: Largest error: one day.
+_LARGEST_ERROR_S = 86_400.0
 
 
 @settings
 class OffsetClock:
-    """Every stamp is off by the same duration: a clock that was never set, a latency that was left out."""
+    """All stamps have the same error, for example because the clock was never set."""
 
     offset_s: Annotated[float, Field(ge=-_LARGEST_ERROR_S, le=_LARGEST_ERROR_S)]
-    """Positive: stamps are later than the measurement."""
+    """Positive if stamps are later than the measurement."""
     kind: Literal["offset"] = "offset"
 
 
 @settings
 class DriftClock:
-    """A clock that is right at the first message and runs too fast (or, below 0, too slow)."""
+    """A clock without error at the first message that runs too fast (positive drift) or too slow."""
 
     drift_ppm: Annotated[float, Field(ge=-1e6, le=1e6)]
-    """Microseconds gained per second; a quartz has some tens."""
+    """Microseconds gained in a second; a quartz clock gains some tens."""
     kind: Literal["drift"] = "drift"
 
 
 @settings
 class JitterClock:
-    """Every stamp is off by a normal error of its own."""
+    """Each stamp has an independent normal error."""
 
     std_s: Annotated[float, Field(ge=0.0, le=_LARGEST_ERROR_S)]
     kind: Literal["jitter"] = "jitter"
@@ -44,7 +46,7 @@ class JitterClock:
 
 @settings
 class QuantisedClock:
-    """A clock that moves in steps: a stamp is the last multiple of the step, up to a step too early."""
+    """A clock with a coarse resolution: stamps are rounded down to a multiple of the step."""
 
     step_s: Annotated[float, Field(ge=1e-9, le=_LARGEST_ERROR_S)]
     kind: Literal["quantised"] = "quantised"
@@ -52,12 +54,15 @@ class QuantisedClock:
 
 @settings
 class ArrivalClock:
-    """The sensor gives no stamp: its receipt is used instead. An offset after it is a guess of the delay."""
+    """The sensor sends no stamps, so the receipt is used as the stamp.
+
+    An `offset` after this model is a guess of the delay.
+    """
 
     kind: Literal["arrival"] = "arrival"
 
 
-#: Every clock model, chosen by `kind`.
+#: Any clock model, selected by `kind`.
 AnyClock = Annotated[
     OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
     Discriminator("kind"),
@@ -70,8 +75,11 @@ def reported_stamps(
     stamps_ns: IntArray,
     receipts_ns: IntArray,
 ) -> IntArray:
-    """Stamps that a sensor with `clocks` reports of messages in the order of measurement, shape (n,) as all others.
-    Each entry of the list has a generator of its own: other clocks before or after one leave what it draws.
+    """Return the stamps that a sensor with `clocks` reports, shape (n,).
+
+    `stamps_ns` and `receipts_ns`, shape (n,), belong to messages in the order of
+    measurement. Each clock has its own random generator, so a change of one clock does
+    not change the draws of the others.
     """
     for clock, child in zip(clocks, rng.spawn(len(clocks)), strict=True):
         match clock:

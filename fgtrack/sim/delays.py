@@ -1,4 +1,7 @@
-"""Delays of the messages of a sensor: delay = receipt - stamp. All are drawn at once, for bursts have a memory."""
+"""Delays of the messages of a sensor: delay = receipt - stamp.
+
+All delays are drawn together, because bursts of delays have a memory.
+"""
 
 import math
 from dataclasses import field
@@ -14,14 +17,14 @@ from fgtrack.core.types import FloatArray
 
 @settings
 class NoDelay:
-    """Everything arrives at once."""
+    """Messages arrive without delay."""
 
     kind: Literal["none"] = "none"
 
 
 @settings
 class ConstantDelay:
-    """Everything arrives equally late."""
+    """All messages have the same delay."""
 
     delay_s: NonNegativeFloat
     kind: Literal["constant"] = "constant"
@@ -29,7 +32,7 @@ class ConstantDelay:
 
 @settings
 class UniformDelay:
-    """Uniform between two delays."""
+    """Delays are uniform between two limits."""
 
     min_s: NonNegativeFloat
     max_s: NonNegativeFloat
@@ -43,9 +46,10 @@ class UniformDelay:
 
 @settings
 class GammaDelay:
-    """`min_s` plus a gamma variable, with the mean and the 90 % quantile that were measured.
-    Shape k solves quantile(k, 0.9) / k = (q90_s - min_s) / (mean_s - min_s). The left side falls from 2.71 at
-    k = 1/2 to 1; a shape below 1/2 is not offered.
+    """Delays are `min_s` plus a gamma variable, given by the mean and the 90 % quantile of the delay.
+
+    Shape k solves quantile(k, 0.9) / k = (q90_s - min_s) / (mean_s - min_s). The left
+    side falls from 2.71 at k = 1/2 towards 1; a shape below 1/2 is not available.
     """
 
     min_s: NonNegativeFloat
@@ -60,13 +64,14 @@ class GammaDelay:
         require(
             low <= ratio <= high,
             "q90_s",
-            f"no gamma fits; (q90_s - min_s) / (mean_s - min_s) must lie in [{low:.3f}, {high:.3f}]",
+            f"no gamma distribution has this quantile: (q90_s - min_s) / (mean_s - min_s) must lie in "
+            f"[{low:.3f}, {high:.3f}]",
             self.q90_s,
         )
 
     @cached_property
     def shape(self) -> float:
-        """Shape k of the gamma part."""
+        """Shape k of the gamma distribution."""
         from scipy.optimize import brentq
 
         ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
@@ -80,13 +85,13 @@ class GammaDelay:
 
     @property
     def scale_s(self) -> float:
-        """Scale of the gamma part."""
+        """Scale of the gamma distribution."""
         return (self.mean_s - self.min_s) / self.shape
 
 
 @settings
 class LossyDelay:
-    """Another model, and messages that never arrive, each with `probability`."""
+    """Each message is lost with `probability`; the others have delays of the model `base`."""
 
     probability: Probability
     base: "AnyDelay" = field(default_factory=NoDelay)
@@ -95,12 +100,13 @@ class LossyDelay:
 
 @settings
 class MarkovDelay:
-    """A chain of two states, good and bad, each with a model of its own, that moves from message to message.
+    """A Markov chain with the states good and bad that moves from message to message; each state has its delay model.
 
-    After a message in the good state the next one is in the bad state with probability `to_bad`, and back with
-    `to_good` (E. N. Gilbert, Capacity of a burst-noise channel, Bell System Technical Journal 39(5), 1960). A
-    share to_bad / (to_bad + to_good) of the messages is in the bad state, in bursts of 1 / `to_good` messages on
-    average. The first message finds the chain as it is in the long run.
+    After a message in the good state, the next message is in the bad state with
+    probability `to_bad`; back with `to_good` (E. N. Gilbert, Capacity of a burst-noise
+    channel, Bell System Technical Journal 39(5), 1960). A share to_bad / (to_bad +
+    to_good) of the messages is in the bad state, in bursts of 1 / `to_good` messages on
+    average. The first message has the stationary distribution.
     """
 
     good: "AnyDelay"
@@ -112,9 +118,11 @@ class MarkovDelay:
 
 @settings
 class MarkovTimeDelay:
-    """`MarkovDelay` in continuous time: the link itself is good or bad, whoever sends how often.
-    In the good state it turns bad at the rate `to_bad_per_s` (a), and back at `to_good_per_s` (b): it is bad for
-    a share a / (a + b) of the time, for 1 / b on average. Over dt, P(bad | good) = a / (a + b) (1 - exp(-(a + b) dt)).
+    """`MarkovDelay` in continuous time: the link is good or bad, independently of the rate of messages.
+
+    In the good state it turns bad at the rate `to_bad_per_s` (a), and back at
+    `to_good_per_s` (b). It is bad for a share a / (a + b) of the time, for 1 / b on
+    average. Over dt, P(bad | good) = a / (a + b) (1 - exp(-(a + b) dt)).
     """
 
     good: "AnyDelay"
@@ -124,7 +132,7 @@ class MarkovTimeDelay:
     kind: Literal["markov_time"] = "markov_time"
 
 
-#: Every delay model, chosen by `kind`.
+#: Any delay model, selected by `kind`.
 AnyDelay = Annotated[
     NoDelay
     | ConstantDelay
@@ -135,11 +143,13 @@ AnyDelay = Annotated[
     | MarkovTimeDelay,
     Discriminator("kind"),
 ]
-_MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
+#: Limits of the shape of a `GammaDelay`.
+_MIN_SHAPE = 0.5
+_MAX_SHAPE = 1e6
 
 
 def _relative_q90(log_shape: float) -> float:
-    """90 % quantile of a gamma distribution over its mean."""
+    """Return the 90 % quantile of a gamma distribution, divided by its mean."""
     from scipy.special import gammaincinv
 
     shape = math.exp(log_shape)
@@ -149,7 +159,10 @@ def _relative_q90(log_shape: float) -> float:
 def draw_delays(
     model: AnyDelay, rng: np.random.Generator, stamps_s: FloatArray
 ) -> FloatArray:
-    """Delays in s of the messages of one sensor stamped `stamps_s` (ascending), shape (n,), NaN for a lost one."""
+    """Draw the delays in s of one sensor's messages, shape (n,); a lost message has NaN.
+
+    `stamps_s`, shape (n,), are the ascending stamps of the messages.
+    """
     n = len(stamps_s)
     match model:
         case NoDelay():
@@ -166,17 +179,21 @@ def draw_delays(
             return delays_s
         case MarkovDelay():
             share = model.to_bad / (model.to_bad + model.to_good)
-            to_bad, to_good = np.full(n, model.to_bad), np.full(n, model.to_good)
+            to_bad = np.full(n, model.to_bad)
+            to_good = np.full(n, model.to_good)
         case MarkovTimeDelay():
             rate_per_s = model.to_bad_per_s + model.to_good_per_s
             share = model.to_bad_per_s / rate_per_s
             forgotten = -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1]))
-            to_bad, to_good = share * forgotten, (1.0 - share) * forgotten
-    draws, bad = rng.random(n), np.zeros(n, dtype=bool)
+            to_bad = share * forgotten
+            to_good = (1.0 - share) * forgotten
+    draws = rng.random(n)
+    bad = np.zeros(n, dtype=bool)
     bad[:1] = draws[:1] < share
     for k in range(1, n):  # from message k - 1 to k
         bad[k] = draws[k] >= to_good[k] if bad[k - 1] else draws[k] < to_bad[k]
-    good_s = draw_delays(model.good, rng, stamps_s)  # both are drawn for all messages
+    # Both models draw for all messages.
+    good_s = draw_delays(model.good, rng, stamps_s)
     return np.where(bad, draw_delays(model.bad, rng, stamps_s), good_s)
 
 

@@ -1,6 +1,6 @@
-"""The re-delayer: a recorded stream whose detections arrive later, earlier, not at all, or with wrong stamps.
+"""Re-delays a recorded stream: detections arrive later, earlier, not at all, or with wrong stamps.
 
-What was measured stays as it was recorded; so the same drive can be replayed under any delays.
+The measured values stay. So the same drive can be replayed with any delays.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,20 +15,20 @@ from fgtrack.core.types import DetectionList, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay, draw_delays
 
-#: Stands for all sensors that are not named.
+#: Name that stands for all sensors without an entry of their own.
 OTHERS = "*"
 
 
 @settings
 class SensorDelays:
-    """Delays, losses and clock errors of the lists of one sensor."""
+    """Delays, losses and clock errors of one sensor's lists."""
 
     delay: AnyDelay | None = None
-    """Delay behind the recorded stamp; null keeps the recorded receipt. Kind `none`: the stamp is the arrival."""
+    """Delay after the recorded stamp; null keeps the recorded receipt. Kind `none`: lists arrive at their stamp."""
     clock: tuple[AnyClock, ...] = ()
-    """Errors of the stamps that it reports; the delay is still that behind the recorded one."""
+    """Errors of the reported stamps; delays still count from the recorded stamp."""
     loss_probability: Probability = 0.0
-    """Probability that a list never arrives, each by itself."""
+    """Probability that a list is lost, independently of other lists."""
 
 
 def redelay(
@@ -36,16 +36,21 @@ def redelay(
     delays: Mapping[str, SensorDelays],
     rng: np.random.Generator,
 ) -> tuple[Iterator[Message], dict[str, int]]:
-    """Return `messages` with the detections of the sensors in `delays` under other delays, and the lists lost by each.
+    """Return `messages` with new delays of the sensors in `delays`, and the number of lost lists by sensor.
 
-    `OTHERS` stands for all sensors that are not named. The receipt becomes the stamp plus a delay, drawn for all lists
-    of a sensor in the order of their stamps. The ego, the truth and sensors that are not named keep theirs. Every
-    sensor, and in it delays, losses and clock errors, draw from a generator of their own. Detections with stamps of
-    their own follow their list's error. At the same receipt, what keeps its receipt comes first, in its old order; then
-    sensor by sensor, by stamp. A `DataError` of the input comes after everything before it. Raises `CallError` if a
-    sensor of `delays` is not in the input.
+    `OTHERS` in `delays` stands for all sensors without an entry. The receipt of a list
+    becomes its stamp plus a delay; the delays of a sensor are drawn in the order of the
+    stamps. The ego, the truth and sensors without an entry keep their receipts. Each
+    sensor has its own random generators for delays, losses and clock errors. Detections
+    with stamps of their own get the error of their list's stamp.
+
+    At equal receipts, messages that keep their receipt come first, in their old order.
+    Lists with new receipts follow, sensor by sensor and by stamp. A `DataError` of the
+    input is raised after all messages before it. Raises `CallError` if a sensor in
+    `delays` is not in the input.
     """
-    read, broken = list[Message](), list[DataError]()
+    read = list[Message]()
+    broken = list[DataError]()
     try:
         for message in messages:
             read.append(message)
@@ -59,17 +64,17 @@ def redelay(
     names = np.array(
         [item.sensor if isinstance(item, DetectionList) else "" for item in read]
     )
-    reported_ns, priority, lost = (
-        stamps_ns.copy(),
-        np.zeros_like(stamps_ns),
-        np.zeros(len(read), dtype=bool),
-    )
-    known, num_lost = sorted(set(names.tolist()) - {""}), dict[str, int]()
+    reported_ns = stamps_ns.copy()
+    priority = np.zeros_like(stamps_ns)
+    lost = np.zeros(len(read), dtype=bool)
+    known = sorted(set(names.tolist()) - {""})
+    num_lost = dict[str, int]()
     for sensor in delays:
         if sensor not in (*known, OTHERS):
-            there, hint = ", ".join(known) or "none", did_you_mean(sensor, known)
+            listed = ", ".join(known) or "none"
+            hint = did_you_mean(sensor, known)
             raise CallError(
-                f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}"
+                f"sensor {sensor!r} is not in the input, whose sensors are: {listed}{hint}"
             )
     others = (
         {sensor: delays[OTHERS] for sensor in known if sensor not in delays}
@@ -82,7 +87,8 @@ def redelay(
     for number, (sensor, child) in enumerate(
         zip(chosen, rng.spawn(len(chosen)), strict=True), 1
     ):
-        settings, (delay_rng, loss_rng, clock_rng) = chosen[sensor], child.spawn(3)
+        settings = chosen[sensor]
+        delay_rng, loss_rng, clock_rng = child.spawn(3)
         own = np.flatnonzero(names == sensor)
         own = own[np.argsort(stamps_ns[own], kind="stable")]
         lost[own] = loss_rng.random(len(own)) < settings.loss_probability
@@ -101,13 +107,13 @@ def redelay(
             settings.clock, clock_rng, stamps_ns[own], receipts_ns[own]
         )
         num_lost[sensor] = int(lost[own].sum())
-    # What keeps its receipt also keeps its order among equals: no stamp in its key.
+    # Messages that keep their receipt are not sorted by stamp, so they keep their order at equal receipts.
     order = np.lexsort((np.where(priority > 0, stamps_ns, 0), priority, receipts_ns))
 
     def redelayed() -> Iterator[Message]:
         for k in order[~lost[order]].tolist():
             message = read[k]
-            if isinstance(message, DetectionList):  # all others keep their stamp
+            if isinstance(message, DetectionList):  # other messages keep their stamp
                 message = restamped(message, int(reported_ns[k]))
             yield replace(message, receipt_ns=int(receipts_ns[k]))
         for error in broken:
@@ -117,7 +123,7 @@ def redelay(
 
 
 def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:
-    """`message` with another stamp; detections' own stamps move as their list's does."""
+    """Return `message` with the stamp `stamp_ns`; its detections' own stamps move by the same time."""
     error_ns = stamp_ns - message.stamp_ns
     objects = tuple(
         item

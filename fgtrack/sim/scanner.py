@@ -1,4 +1,4 @@
-"""Scans: detections of the objects by a simulated sensor, and its clutter."""
+"""Simulates the scans of a sensor: detections of the objects, and clutter."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from fgtrack.sim.sensor import POLAR, SimulatedSensor
 
 
 class _Detected(NamedTuple):
-    """m detections of one sensor: the scan of each, its values, and a random key that shuffles a scan."""
+    """Detections of one sensor, m in number: scan indices, measured values, and random keys that shuffle each scan."""
 
     scan: IntArray
     z: FloatArray
@@ -36,13 +36,13 @@ class _Detected(NamedTuple):
 
 
 def _joined(parts: Sequence[_Detected]) -> _Detected:
-    """All detected of `parts`."""
+    """Concatenate `parts`."""
     return _Detected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Scanner:
-    """One sensor riding on the ego: `ego`, shape (n, 6), are the ego's states at its n scans."""
+    """Simulates one sensor on the ego; `ego`, shape (n, 6), contains the ego's states at the sensor's n scans."""
 
     sensor: SimulatedSensor
     ego: FloatArray
@@ -55,8 +55,10 @@ class Scanner:
         objects: Sequence[FloatArray],
         track: TrackMap | None,
     ) -> list[tuple[Detection, ...]]:
-        """Detections of the n scans; `objects` holds the states of each object at the scans, shape (n, 6).
-        Every object and the clutter have a generator of their own.
+        """Return the detections of the n scans.
+
+        `objects` contains the states of each object at the scans, shape (n, 6). Every
+        object and the clutter have their own random generator.
         """
         clutter_rng, objects_rng = rng.spawn(2)
         children = objects_rng.spawn(len(objects))
@@ -77,8 +79,10 @@ class Scanner:
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 
     def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
-        """Detections of one object: none, one or two (a split) in every scan."""
-        sensor, n, everything = self.sensor, len(states), np.arange(len(states))
+        """Detect one object: in each scan none, one or, for a split object, two detections."""
+        sensor = self.sensor
+        n = len(states)
+        everything = np.arange(n)
         seen = self._visible(everything, states) & (
             rng.random(n) < sensor.detection_probability
         )
@@ -96,8 +100,9 @@ class Scanner:
         return _joined(parts)
 
     def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Detected:
-        """Detections of ghosts, measured without noise."""
-        sensor, clutter = self.sensor, self.sensor.clutter
+        """Draw clutter: detections of objects that do not exist, without measurement noise."""
+        sensor = self.sensor
+        clutter = sensor.clutter
         scan = np.repeat(
             np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego))
         )
@@ -112,7 +117,7 @@ class Scanner:
             ghosts[:, :2] = track.position(s, rng.uniform(-right_m, left_m))
             ghosts[:, YAW] = track.view(ghosts[:, :2], 0.0, 0.0).yaw_rad
         else:
-            # Uniform over the area of a ring: the square of the range is uniform.
+            # Clutter is uniform over the area of a ring, so the square of the range is uniform.
             distance = np.sqrt(
                 rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m)
             )
@@ -132,15 +137,15 @@ class Scanner:
     def _add_noise(
         self, rng: np.random.Generator, scan: IntArray, states: FloatArray
     ) -> FloatArray:
-        """Noisy measurements of `states`, shape (m, k)."""
-        sensor, components = self.sensor, self.sensor.components
+        """Return noisy measurements of `states` in the scans `scan`, shape (m, k)."""
+        sensor = self.sensor
+        components = sensor.components
         noise = rng.standard_normal((len(scan), len(components)))
         outlier = rng.random(len(scan)) < sensor.outlier_probability
         noise *= np.where(outlier, sensor.outlier_factor, 1.0)[:, None]
         noise *= [sensor.std[name] for name in components]
-        if (
-            sensor.frame == "ego"
-        ):  # x_m and y_m come first: along and across the line of sight
+        # x_m and y_m come first; their noise is drawn along and across the line of sight.
+        if sensor.frame == "ego":
             line_of_sight = self._relative(scan, states)[:, 1] + sensor.mount.yaw_rad
             noise[:, :2] = _rotated(noise[:, :2], line_of_sight)
         z = self._measure(scan, states) + noise
@@ -149,7 +154,7 @@ class Scanner:
         return z
 
     def _measure(self, scan: IntArray, states: FloatArray) -> FloatArray:
-        """Measurements without noise, shape (m, k), of `states`, shape (m, 6), in the scans `scan`."""
+        """Return noiseless measurements, shape (m, k), of `states`, shape (m, 6), in the scans `scan`."""
         mount = Mount() if self.sensor.frame == "ego" else self.sensor.mount
         origin, _, yaw = self._carried(scan, mount)
         values = {"yaw_rad": states[:, YAW] - yaw, "speed_mps": states[:, SPEED]}
@@ -158,7 +163,7 @@ class Scanner:
         return np.stack([values[name] for name in self.sensor.components], axis=1)
 
     def _visible(self, scan: IntArray, states: FloatArray) -> BoolArray:
-        """True for those of `states` that lie in the field of view, shape (m,)."""
+        """Mask (m,) of the `states` inside the field of view and the range of the sensor."""
         sensor = self.sensor
         distance, bearing, _ = self._relative(scan, states).T
         return in_view(
@@ -171,7 +176,7 @@ class Scanner:
         )
 
     def _relative(self, scan: IntArray, states: FloatArray) -> FloatArray:
-        """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""
+        """Return range, bearing and range rate of `states` relative to the moving sensor, shape (m, 3)."""
         origin, velocity, yaw = self._carried(scan, self.sensor.mount)
         relative = np.concatenate(
             [
@@ -185,7 +190,7 @@ class Scanner:
     def _carried(
         self, scan: IntArray, mount: Mount
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Origin, its velocity, (m, 2), and yaw, (m,), in the map, of a frame mounted in the detection frame."""
+        """Return origin and velocity, (m, 2), and yaw, (m,), in the map, of a frame mounted in the detection frame."""
         x, y, yaw, speed, yaw_rate = self.ego[scan, : YAW_RATE + 1].T
         ahead_m = self.detection_origin_x_m + mount.x_m
         x, y, vx, vy = body_point(x, y, yaw, speed, yaw_rate, ahead_m, mount.y_m)
@@ -193,5 +198,5 @@ class Scanner:
 
 
 def _rotated(vectors: FloatArray, angles_rad: FloatArray) -> FloatArray:
-    """Vectors, shape (m, 2), each turned by its angle, shape (m,)."""
+    """Return `vectors`, shape (m, 2), each rotated by its angle, shape (m,)."""
     return np.asarray((rotations(angles_rad) @ vectors[:, :, None])[:, :, 0])

@@ -1,4 +1,4 @@
-"""A scenario: the world, the ego vehicle, its sensors, and how late everything arrives."""
+"""A scenario: the world, the ego vehicle, its sensors, and the delays of all messages."""
 
 from dataclasses import field
 from typing import Annotated
@@ -14,7 +14,7 @@ from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 
 @settings
 class EgoMessages:
-    """Messages of the localisation of the ego vehicle."""
+    """Settings of the ego's localisation messages."""
 
     rate_hz: Rate = 100.0
     position_std_m: NonNegativeFloat = 0.02
@@ -28,7 +28,7 @@ class EgoMessages:
 
 @settings
 class Scenario:
-    """All that `simulate` needs besides a random generator. Object i of the truth is opponent i."""
+    """Settings of a simulation; only a random generator is needed besides. Object i of the truth is opponent i."""
 
     ego: AnyVehicle
     opponents: tuple[AnyVehicle, ...] = ()
@@ -41,7 +41,7 @@ class Scenario:
     detection_origin_x_m: float = 0.0
     """Origin of the detection frame in the ego frame, as `ego.detection_origin_x_m` of a configuration."""
     start_ns: NonNegativeInt = 1_000_000_000_000
-    """Stamp of the start."""
+    """Stamp at the start."""
 
     def __post_init__(self) -> None:
         names = [sensor.name for sensor in self.sensors]
@@ -53,6 +53,6 @@ class Scenario:
         require(
             self.map is not None or not on_track,
             "map",
-            "a vehicle or clutter on the track needs one",
+            "a vehicle or clutter on the track needs a map",
             self.map,
         )

@@ -1,4 +1,4 @@
-"""From a scenario to the messages that a tracker would have received."""
+"""Simulates the messages that a tracker would receive in a scenario."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,16 +31,19 @@ from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle
 
 States = Callable[[FloatArray], FloatArray]
-"""True states of a vehicle, shape (n, 6), at times since the start, shape (n,)."""
+"""Returns the true states of a vehicle, shape (n, 6), at times since the start, shape (n,)."""
 
 
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
-    """Messages of `scenario` in order of receipt; at the same receipt truth, ego, sensors in their order.
+    """Return the messages of `scenario` in order of receipt; at equal receipts the truth, the ego, then the sensors.
 
-    Every vehicle and every sensor, and in it the delays, the clock errors, the clutter and the detections of each
-    object, draw from a generator of their own: another sensor, delay or clock model leaves everything else as it was. A
-    clock changes what is reported as the stamp, never the measurement. A message that its delay model loses is
-    not in the list. Raises `DataError` if the map cannot be read.
+    Every vehicle and every sensor has its own random generators. A sensor has separate
+    generators for delays, clock errors, clutter and the detections of each object. So a
+    change of a sensor, a delay or a clock model leaves the other draws unchanged. A
+    clock model changes the reported stamp, never the measurement. Lost messages are
+    left out.
+
+    Raises `DataError` if the map cannot be read.
     """
     vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)
     track = None
@@ -71,7 +74,7 @@ def _states_of(
 ) -> States:
     if isinstance(vehicle, DrawnVehicle):
         return vehicle.trajectory(rng, duration_s).states
-    assert path is not None, "a scenario without a map has no vehicle on a track"
+    assert path is not None, "`Scenario` requires a map for a vehicle on a track"
     return partial(vehicle.states, path)
 
 
@@ -146,7 +149,7 @@ def _scans(
 def _stamps(
     scenario: Scenario, times: FloatArray | float
 ) -> tuple[IntArray, FloatArray]:
-    """Stamps of times since the start, or at a rate, and the times, of whole nanoseconds."""
+    """Return stamps and times since the start in whole nanoseconds, for given times or for a rate."""
     if isinstance(times, float):
         times = np.arange(math.floor(scenario.duration_s * times + 1e-9) + 1) / times
     since_start_ns = np.rint(times * NS_PER_S).astype(np.int64)
@@ -156,8 +159,7 @@ def _stamps(
 def _receipts(
     delay: AnyDelay, rng: np.random.Generator, stamps_ns: IntArray, times_s: FloatArray
 ) -> tuple[IntArray, BoolArray]:
-    """Receipt of each stamp, and True where the message is lost."""
+    """Return the receipt of each stamp, and a mask of lost messages."""
     delays_s = draw_delays(delay, rng, times_s)
-    return stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(
-        np.int64
-    ), np.isnan(delays_s)
+    delays_ns = np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64)
+    return stamps_ns + delays_ns, np.isnan(delays_s)

@@ -1,4 +1,4 @@
-"""Motion of the vehicles: driving along a track as given, or drawn from the motion model itself."""
+"""Motion of the vehicles: prescribed on a track, or drawn from the motion model."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,27 +17,27 @@ from fgtrack.models.path import Path
 
 @settings
 class LaneChange:
-    """A move to another lateral offset: a quintic, at rest across the track at both ends."""
+    """A change of the lateral offset along a quintic; lateral speed and acceleration are 0 at both ends."""
 
     start_s: NonNegativeFloat
-    """Time at which it starts."""
+    """Time at which the lane change starts."""
     duration_s: PositiveFloat
     lateral_m: float
-    """Lateral offset that it ends at, positive to the left of the reference line."""
+    """Lateral offset at the end, positive to the left of the reference line."""
 
 
 @settings
 class TrackVehicle:
-    """A vehicle that follows the track. Overtaking comes from speeds and lane changes."""
+    """A vehicle that follows the track; overtaking results from speeds and lane changes."""
 
     arc_m: float
     """Arc length along the reference line at the start."""
     speed: Annotated[tuple[tuple[float, PositiveFloat], ...], Field(min_length=1)]
-    """Knots (time [s], speed along the reference line [m/s]); smooth between them, constant outside."""
+    """Knots (time [s], speed along the reference line [m/s]); the speed is smooth between them and constant outside."""
     lateral_m: float = 0.0
     """Lateral offset at the start, positive to the left."""
     lane_changes: tuple[LaneChange, ...] = ()
-    """In order of time, one after the other."""
+    """Lane changes in the order of time, without overlap."""
     kind: Literal["track"] = "track"
 
     def __post_init__(self) -> None:
@@ -50,17 +50,19 @@ class TrackVehicle:
             require(
                 change.start_s >= end_s,
                 "lane_changes",
-                "one must end before the next",
+                "a lane change must end before the next one starts",
                 change.start_s,
             )
 
     def states(self, path: Path, times_s: FloatArray) -> FloatArray:
-        """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`.
+        """Return the states at `times_s`, shape (n,), since the start of the scenario: shape (n, 6), as `STATE_NAMES`.
 
-        The path parameter u and the lateral offset d are functions of time with derivatives u1, u2 and d1, d2. With the
-        direction psi of the tangent and the scale g (metres of path per unit of u), a prime for the derivative by u:
-        the velocity is w = u1 (g - d psi') along the tangent and d1 across it, and yaw = psi + atan2(d1, w). Yaw rate
-        and acceleration, along the heading, are the exact derivatives of yaw and speed.
+        The path parameter u and the lateral offset d are functions of time with
+        derivatives u1, u2 and d1, d2. The tangent of the path has the direction psi,
+        and the scale g is in metres of path per unit of u. A prime is the derivative by
+        u. Then the velocity is w = u1 (g - d psi') along the tangent and d1 across it,
+        and yaw = psi + atan2(d1, w). Yaw rate and acceleration along the heading are
+        the exact derivatives of yaw and speed.
         """
         u, u1, u2 = self._along(times_s)
         d, d1, d2 = self._across(times_s)
@@ -84,13 +86,13 @@ class TrackVehicle:
         )
 
     def _along(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Path parameter and its first two derivatives by time."""
+        """Return the path parameter and its first two derivatives by time."""
         from scipy.interpolate import CubicHermiteSpline
 
         knots = np.array(self.speed, dtype=np.float64)
         if len(knots) == 1:
             knots = np.vstack([knots, knots + np.array([1.0, 0.0])])
-        # Level at every knot, so that the acceleration has no jump where the speed becomes constant.
+        # The speed has slope 0 at every knot, so the acceleration does not jump where the speed becomes constant.
         speed = CubicHermiteSpline(knots[:, 0], knots[:, 1], np.zeros(len(knots)))
         times = np.append(times_s, 0.0)
         inside = np.clip(times, knots[0, 0], knots[-1, 0])
@@ -99,7 +101,7 @@ class TrackVehicle:
         return u, speed(inside[:-1]), speed(inside[:-1], 1)
 
     def _across(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lateral offset and its first two derivatives by time."""
+        """Return the lateral offset and its first two derivatives by time."""
         d = np.full(len(times_s), self.lateral_m)
         d1, d2 = np.zeros((2, len(times_s)))
         lateral_m = self.lateral_m
@@ -115,7 +117,7 @@ class TrackVehicle:
 
 @settings
 class DrawnVehicle:
-    """A vehicle whose motion is a draw from the CTRV model: a filter with this model is consistent."""
+    """A vehicle whose motion is drawn from the CTRV model, so that a filter with this model is consistent."""
 
     x_m: float
     y_m: float
@@ -124,21 +126,23 @@ class DrawnVehicle:
     yaw_rate_radps: float = 0.0
     motion: CTRV = field(default_factory=CTRV)
     step_s: PositiveFloat = 0.01
-    """Time between two draws of the process noise. Within a step, the noise of one instant is a Brownian
-    bridge; it is exact as long as all sensors together look at most once in a step."""
+    """Time between two draws of the process noise. Between the draws, the noise is a Brownian bridge.
+
+    The distribution is exact if all sensors together measure at most once in a step.
+    """
     kind: Literal["drawn"] = "drawn"
 
     def trajectory(
         self, rng: np.random.Generator, duration_s: float
     ) -> "DrawnTrajectory":
-        """One draw of the motion of this vehicle over `duration_s`."""
+        """Draw one motion of this vehicle over `duration_s`."""
         num_steps = math.ceil(duration_s / self.step_s) + 1
         normals = rng.standard_normal((num_steps, self.motion.dim, 2))
         states = np.empty((num_steps + 1, self.motion.dim))
         noise = np.empty_like(normals)
         states[0] = [getattr(self, name) for name in STATE_NAMES[: self.motion.dim]]
         for k in range(num_steps):
-            # The covariance is singular where a density is zero, so no Cholesky factor; the symmetric root is unique.
+            # With a noise density of 0 the covariance is singular and has no Cholesky factor, but a symmetric root.
             variances, axes = np.linalg.eigh(
                 self.motion.process_noise(states[k], self.step_s)
             )
@@ -151,21 +155,22 @@ class DrawnVehicle:
 
 @dataclass(frozen=True, eq=False)
 class DrawnTrajectory:
-    """A drawn motion: x(t) = prediction from the step before + f noise + sqrt(f (1 - f)) bridge.
-    f is the part of the step that has passed. So the noise up to t and the noise after it are independent and
-    each as large as its share of the step.
+    """A drawn motion: x(t) = prediction from the previous step + f noise + sqrt(f (1 - f)) bridge.
+
+    f is the elapsed fraction of the step. So the noise before t and the noise after t
+    are independent, and the covariance of each is proportional to its time.
     """
 
     vehicle: DrawnVehicle
     step_states: FloatArray
-    """States where the m steps begin and where the last one ends, shape (m + 1, 5)."""
+    """States at the beginning of the m steps and at the end of the last one, shape (m + 1, 5)."""
     noise: FloatArray
     """Process noise of each step, shape (m, 5)."""
     bridge: FloatArray
-    """Independent noise of the same covariance, shape (m, 5)."""
+    """Independent noise with the same covariance, shape (m, 5)."""
 
     def states(self, times_s: FloatArray) -> FloatArray:
-        """As `TrackVehicle.states`; the acceleration is 0, as the model has none."""
+        """Return the states at `times_s` as `TrackVehicle.states`; the acceleration is 0, because CTRV has none."""
         step_s, motion = self.vehicle.step_s, self.vehicle.motion
         k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
         within_s = times_s - k * step_s
@@ -177,15 +182,17 @@ class DrawnTrajectory:
         return states
 
 
-#: Every kind of vehicle, chosen by `kind`.
+#: Any vehicle, selected by `kind`.
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
 
 
-def drawn(
+def draw_states(
     motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator
 ) -> FloatArray:
-    """A draw of the states `dt_s` after `x`, both shape (..., n): the prediction plus N(0, Q(x, dt_s)).
-    Raises `numpy.linalg.LinAlgError` where Q is singular, as with a density of zero.
+    """Draw the states `dt_s` after the states `x`, both of shape (..., n): the prediction plus N(0, Q(x, dt_s)).
+
+    Raises `numpy.linalg.LinAlgError` if Q is singular, for example with a noise density
+    of 0.
     """
     roots = np.linalg.cholesky(motion.process_noise(x, dt_s))
     noise = rng.standard_normal((*x.shape[:-1], 1, x.shape[-1]))

@@ -13,7 +13,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 MOTION = CTRV(
     position_density_m2ps=0.001,
@@ -53,7 +53,7 @@ def errors(
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     x = mean + spread * rng.standard_normal(5)
     for k in range(1, num_steps + 1):
-        x = drawn(MOTION, x, STEP_S, rng)
+        x = draw_states(MOTION, x, STEP_S, rng)
         z = MODEL.predict(x) + std * rng.standard_normal(2)
         measurement = Measurement(nanoseconds(k * STEP_S), MODEL, z, np.diag(std**2))
         for name, one in each.items():

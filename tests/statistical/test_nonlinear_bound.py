@@ -14,7 +14,7 @@ from fgtrack.estimation.registry import estimator
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 STEP_NS = 50_000_000
 START_NS = 1_790_000_000 * NS_PER_S
@@ -71,7 +71,7 @@ def tried(motion: MotionModel) -> Trial:
     x0, P0 = initial_state(motion, PRIOR)
     states = [x0 + rng.standard_normal((NUM_RUNS, 5)) @ np.linalg.cholesky(P0).T]
     for dt_s in (np.diff(stamps_ns) / NS_PER_S).tolist():
-        states.append(drawn(motion, states[-1], dt_s, rng))
+        states.append(draw_states(motion, states[-1], dt_s, rng))
     chain = np.stack(states, axis=1)
 
     def truth(wanted_ns: IntArray) -> FloatArray:

@@ -8,7 +8,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 MOTION = CTRV(
     yaw_density_rad2ps=0.002, yaw_rate_density_rad2ps3=0.02, speed_density_m2ps3=0.5
@@ -42,7 +42,7 @@ def test_the_errors_of_present_and_lagged_states_are_as_large_as_their_covarianc
     for _ in range(NUM_RUNS):
         truth = [MEAN + STD * rng.standard_normal(5)]
         for _ in range(NUM_STEPS):
-            truth.append(drawn(MOTION, truth[-1], STEP_S, rng))
+            truth.append(draw_states(MOTION, truth[-1], STEP_S, rng))
         one = estimator("smoother", MOTION, START, lag_s=1.0)
         for k in sorted(
             range(1, NUM_STEPS + 1),

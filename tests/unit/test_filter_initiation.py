@@ -19,7 +19,7 @@ from fgtrack.estimation.filters.track_initiation import (
 )
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import drawn
+from fgtrack.sim.vehicles import draw_states
 
 METHODS = ("two-point", "regression")
 
@@ -188,7 +188,7 @@ def test_the_state_is_consistent_where_the_direction_is_found(
         )
         estimator = fgtrack.estimator("ekf-replay", motion, start, initiation=method)
         for k in range(1, 7):
-            x = drawn(motion, x, 0.05, rng)
+            x = draw_states(motion, x, 0.05, rng)
             estimator.update(
                 position(k, *(x[:2] + STD_M * rng.standard_normal(2)).tolist())
             )

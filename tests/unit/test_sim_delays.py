@@ -161,7 +161,7 @@ def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
             "max_s: must not be below min_s, is 1e-09",
         ),
         (lambda: GammaDelay(0.1, 0.1, 0.2), "mean_s"),
-        (lambda: GammaDelay(0.1, 0.2, 0.2), "q90_s: no gamma fits"),
+        (lambda: GammaDelay(0.1, 0.2, 0.2), "q90_s: no gamma distribution"),
         (lambda: LossyDelay(probability=-0.1), "probability"),
         (lambda: MarkovDelay(GOOD, BAD, to_bad=0.5, to_good=0.0), "to_good"),
         (

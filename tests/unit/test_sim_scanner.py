@@ -223,7 +223,7 @@ def test_scans_come_at_their_rate_phase_and_jitter() -> None:
     ("settings", "message"),
     [
         ({"std": {"colour": 1.0}}, "std: .*colour"),
-        ({"std": {"x_m": 1.0}}, "std: x_m with y_m"),
+        ({"std": {"x_m": 1.0}}, "std: must contain components"),
         (
             {"split_distance_m": (4.0, 2.0)},
             r"split_distance_m: must be \(smallest, largest\)",
@@ -232,7 +232,10 @@ def test_scans_come_at_their_rate_phase_and_jitter() -> None:
             {"clutter": {"speed_mps": (5.0, 0.0)}},
             r"speed_mps: must be \(smallest, largest\)",
         ),
-        ({"std": {**NO_NOISE, "range_m": 1.0}}, "std: positions or range"),
+        (
+            {"std": {**NO_NOISE, "range_m": 1.0}},
+            "std: must contain either positions or range",
+        ),
         ({"jitter_s": 0.05}, "jitter_s"),
         ({"max_range_m": math.inf}, "max_range_m"),
         ({"max_range_behind_m": 100.1}, "max_range_behind_m"),

@@ -9,7 +9,7 @@ from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
 from fgtrack.models.motion import CTRV
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path
-from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackVehicle, drawn
+from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackVehicle, draw_states
 
 OVAL = make_oval()
 PATH = Path.through(OVAL.table[:, :2])
@@ -97,7 +97,7 @@ def test_a_drawn_vehicle_moves_as_its_motion_model_says(
                 speed=((0.0, 9.0),),
                 lane_changes=(LaneChange(0.0, 2.0, 1.0), LaneChange(1.0, 2.0, 0.0)),
             ),
-            "lane_changes: one must end before the next",
+            "lane_changes: a lane change must end before the next one starts",
         ),
         (lambda: DrawnVehicle(0.0, 0.0, 0.0, 9.0, step_s=0.0), "step_s"),
     ],
@@ -109,7 +109,7 @@ def test_a_setting_that_makes_no_sense_is_named(make: object, message: str) -> N
 
 def test_draws_have_the_mean_and_the_covariance_of_the_model() -> None:
     x, dt_s, num = np.array([3.0, -2.0, 3.1, 20.0, 0.2]), 0.1, 20_000
-    found = drawn(
+    found = draw_states(
         CTRV(), np.tile(x, (num, 1)), dt_s, np.random.default_rng(1)
     ) - CTRV().predict(x, dt_s)
     found[:, YAW] = wrap_angles(found[:, YAW])
