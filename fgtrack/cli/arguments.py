@@ -11,7 +11,7 @@ Input = Annotated[
     Path,
     Argument(
         metavar="INPUT",
-        help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV, data set.",
+        help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
     ),
 ]
 ConfigFile = Annotated[
@@ -20,30 +20,30 @@ ConfigFile = Annotated[
 ]
 TrackMap = Annotated[
     str | None,
-    Option("--map", help="Map of the track (CSV), or `oval` for the built-in one."),
+    Option("--map", help="Map of the track (CSV), or `oval` for the built-in map."),
 ]
 PitMap = Annotated[
     str | None, Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")
 ]
 Settings = Annotated[
     list[str] | None,
-    Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable."),
+    Option(
+        "--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable."
+    ),
 ]
 Overwrite = Annotated[
-    bool, Option("--overwrite", help="Replace what such a command wrote there before.")
+    bool, Option("--overwrite", help="Replace an existing output of this command.")
 ]
 Seed = Annotated[int, Option(min=0, help="Seed of the random generator.")]
 Reference = Annotated[
     str | None,
     Option(
-        "--reference", help="Sensor with the correct clock, where two do not agree."
+        "--reference", help="Sensor with the correct clock, if two sensors disagree."
     ),
 ]
 Runs = Annotated[
     list[Path],
-    Argument(
-        metavar="RUN...", help="Run folders, or folders of runs, as that of the demo."
-    ),
+    Argument(metavar="RUN...", help="Run folders, or folders that contain runs."),
 ]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[
@@ -51,8 +51,8 @@ StorageOption = Annotated[
 ]
 Form = Literal["md", "csv", "latex", "json"]
 FormOption = Annotated[
-    Form | None, Option("--format", help="Print this instead of tables for a terminal.")
+    Form | None, Option("--format", help="Print this format instead of text tables.")
 ]
 All = Annotated[
-    bool, Option("--all", help="Show every table and column, not the main ones alone.")
+    bool, Option("--all", help="Show all tables and columns, not only the main ones.")
 ]

@@ -1,4 +1,4 @@
-"""`fgtrack info`, `advise` and `offsets`: contents of a recording, its problems, and the clocks of its sensors."""
+"""`fgtrack info`, `advise` and `offsets`: contents and problems of a recording, clock offsets of its sensors."""
 
 import shlex
 from contextlib import suppress
@@ -46,7 +46,7 @@ from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.build import build_road
-from fgtrack.pipeline.replay import Feed, located
+from fgtrack.pipeline.replay import Feed, with_origin
 
 _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
 
@@ -56,32 +56,34 @@ def info(
     config_file: ConfigFile = None,
     write: Annotated[
         Path | None,
-        Option(metavar="MY.yaml", help="Write a configuration to start from."),
+        Option(metavar="MY.yaml", help="Write a guessed configuration to start from."),
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Show topics, rates and delays of a recording.
 
-    With a configuration (or with the one of --write, which guesses what topics, fields and columns are) also what it
-    would take from them, what a message of each is read as, and the detections of the first seconds.
+    With a configuration, also shows how topics or columns are used, the first message
+    of each, and the detections of the first seconds. --write guesses such a
+    configuration.
     """
     if write is not None:
         if config_file is not None:
             raise CallError(
-                "--write, -c: a starting configuration is made from the recording alone, give one of them"
+                "--write, -c: --write guesses a configuration from the recording alone, give only one of the options"
             )
         check_output(write, overwrite)
         check_no_overlap(write, [recording])
         text = starting_config(recording)
         write_file(write, text, overwrite)
         if not as_json:
-            say(f"{write}: written; check its guesses, they are applied below")
+            say(f"{write}: written; check the guesses, which are applied below")
         config_file = str(write)
     config = None if config_file is None else read_config(config_file)
     result = describe(recording, None if config is None else config.input)
     topics = _topics(result, NO_VALUE if config is None else "ignored")
-    comes_to, problem = (config or Config()).effective, result.problem
+    effective = (config or Config()).effective
+    problem = result.problem
     if as_json:
         values = {
             name: getattr(result, name)
@@ -94,7 +96,7 @@ def info(
                 "path": str(result.path),
                 **values,
                 "topics": topics.plain(),
-                "effective": plain(comes_to),
+                "effective": plain(effective),
             },
         )
     else:
@@ -104,12 +106,12 @@ def info(
             if config is None
             else None
         )
-        sentences([suited or f"{config_file or 'without a configuration'}: {comes_to}"])
+        sentences(
+            [suited or f"{config_file or 'without a configuration'}: {effective}"]
+        )
         if config is None and suited is None:
-            with (
-                suppress(FgtrackError),
-                progress("detections"),
-            ):  # whose topics and columns nothing names
+            # Without a configuration, topics or columns may be unknown.
+            with suppress(FgtrackError), progress("detections"):
                 sentences(assumed(Config(), open_input(recording)).lines())
         elif config is not None and problem is None:
             problem = _try_out(recording, config)
@@ -118,11 +120,13 @@ def info(
 
 
 def _try_out(recording: Path, config: Config) -> str | None:
-    """Print what is read in the first seconds; gives the problem of the recording."""
+    """Print the contents of the first seconds as the configuration reads them; return the recording's problem."""
     with progress("first seconds"):
         source = open_input(recording, config.input)
         result = assumed(config, source)
-        build_road(result.config.map, result.config.defects)  # its files are there
+        build_road(
+            result.config.map, result.config.defects
+        )  # raises if files are missing
         readable = UntilBreak(source.messages())
         messages = list(messages_within(readable, nanoseconds(TRIAL_S)))
         feed = Feed(messages, result.config)
@@ -191,13 +195,13 @@ def advise(
     config_file: ConfigFile = None,
     out: Annotated[
         Path | None,
-        Option("-o", "--out", help="Configuration that follows the advice."),
+        Option("-o", "--out", help="Write a configuration that follows the advice."),
     ] = None,
     tune: Annotated[
-        bool, Option("--tune", help="Fit noise that does not fit, too.")
+        bool, Option("--tune", help="Also fit the noise if it is inconsistent.")
     ] = False,
     ledger: Annotated[
-        bool, Option("--ledger", help="Compare policies for late lists, too.")
+        bool, Option("--ledger", help="Also compare policies for late lists.")
     ] = False,
     reference: Reference = None,
     track_map: TrackMap = None,
@@ -208,7 +212,7 @@ def advise(
 ) -> None:
     """Report what is late or wrong, and which settings correct it.
 
-    Sentences in order of importance, and the lateness of each sensor.
+    Prints sentences in the order of importance, and the lateness of each sensor.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     if out is not None:
@@ -234,9 +238,10 @@ def advise(
     show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None and not as_json:
         again = ["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"]
-        say(f"{out}: written; apply it by `{shlex.join(again)}`")
+        say(f"{out}: written; apply the settings by `{shlex.join(again)}`")
     if advice.broken is not None:
-        raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
+        problem = with_origin(advice.broken, str(recording))
+        raise DataError(f"{problem}; the messages before are used")
 
 
 def offsets(
@@ -250,7 +255,7 @@ def offsets(
 ) -> None:
     """Estimate constant clock offsets of sensors.
 
-    Reports which ones are not identifiable.
+    Reports sensors whose offset is not identifiable.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
@@ -269,9 +274,8 @@ def offsets(
     if not as_json:
         sentences(f"{name}: {text}" for name, text in verdicts.items())
     if readable.error is not None:
-        raise DataError(
-            f"{located(str(readable.error), str(recording))}; used up to there"
-        )
+        problem = with_origin(str(readable.error), str(recording))
+        raise DataError(f"{problem}; the messages before are used")
 
 
 def _offsets(report: OffsetReport) -> Table:

@@ -1,4 +1,4 @@
-"""Entry point of the installed command: Ctrl-C is one line and one exit code, also while everything loads."""
+"""Entry point of the installed command; Ctrl-C gives one line and one exit code, even during the imports."""
 
 import sys
 

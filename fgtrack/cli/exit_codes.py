@@ -1,5 +1,7 @@
 """Exit codes of the command."""
 
-DONE, BAD_DATA, BAD_CALL = 0, 1, 2
+DONE = 0
+BAD_DATA = 1
+BAD_CALL = 2
 INTERRUPTED = 130
-"""Of Ctrl-C: 128 plus the number of the signal, as shells have it."""
+"""Exit code after Ctrl-C: 128 plus the number of the signal, as in shells."""

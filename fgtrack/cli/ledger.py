@@ -1,4 +1,4 @@
-"""`fgtrack ledger`: where the error of the present comes from."""
+"""`fgtrack ledger`: causes of the error of the present estimate."""
 
 from pathlib import Path
 from typing import Annotated
@@ -28,22 +28,23 @@ def ledger(
         str | None,
         Option(
             metavar="TUNED.yaml",
-            help="Fitted noise and clocks, as `fgtrack tune` and `advise --tune` write them.",
+            help="Fitted noise and clocks from `fgtrack tune` or `advise --tune`.",
         ),
     ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
     figure: Annotated[
-        Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")
+        Path | None, Option(metavar="FILE.png", help="Draw the shares as a waterfall.")
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Split the error of the present into lateness, policy, noise.
 
-    Repeats the measurements of one association with every policy, each as it came and as if nobody were late. Without
-    truth predicted variances stand for errors. INPUT may be a run folder.
+    Replays the associated measurements with every policy for late lists, once as
+    received and once without delays. Without truth, predicted variances replace errors.
+    INPUT may be a run folder.
     """
     if figure is not None:
         check_output(figure, overwrite)
@@ -54,7 +55,7 @@ def ledger(
     if figure is not None:
         with new_file(figure, overwrite) as file:
             parts = [(item.cause, item.mean_square_m2) for item in result.waterfall]
-            predicted = "" if result.with_truth else ", as it predicts it (no truth)"
+            predicted = "" if result.with_truth else ", predicted (no truth)"
             title = (
                 f"Where the position error of {result.estimator} comes from{predicted}"
             )

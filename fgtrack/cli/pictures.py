@@ -1,4 +1,4 @@
-"""`fgtrack figure` and `report`: pictures of runs and sweeps, and one page of runs to look at."""
+"""`fgtrack figure` and `report`: figures of runs and sweeps, and an HTML report of runs."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -32,52 +32,52 @@ def figure(
         ),
     ],
     out: Annotated[
-        Path, Option("-o", "--out", help="Folder for the pictures, or one .pdf.")
+        Path, Option("-o", "--out", help="Folder for the figures, or a .pdf file.")
     ],
     form: Annotated[
-        Literal["png", "svg", "pdf"], Option("--format", help="Format of the pictures.")
+        Literal["png", "svg", "pdf"], Option("--format", help="Format of the figures.")
     ] = "png",
     stamp: Annotated[
         float | None,
-        Option(min=0.0, max=1e9, help="Close-up so many s after the first tick."),
+        Option(min=0.0, max=1e9, help="Time of the close-up [s after the first tick]."),
     ] = None,
     width: Annotated[
         str | None,
-        Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title."),
+        Option(metavar="3.4in", help="Width on paper (in, cm, mm); omits the title."),
     ] = None,
     font: Annotated[
-        str | None, Option(metavar="NAME", help='Font, as "Times New Roman".')
+        str | None, Option(metavar="NAME", help='Font, e.g. "Times New Roman".')
     ] = None,
     style: Annotated[
-        str | None, Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")
+        str | None, Option(metavar="FILE", help="Matplotlib style (.mplstyle).")
     ] = None,
     every: Annotated[
-        bool, Option("--all", help="Draw every object, run and metric, not the few.")
+        bool, Option("--all", help="Draw all objects, runs and metrics.")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw runs or a sweep: late detections, map, errors.
 
-    Of runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, errors over time and against
-    lag. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and 95 % interval over the
-    seeds.
+    Runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, and
+    errors over time and against lag. With many objects or runs, only the worst are
+    drawn. A sweep: metrics over the grid, with mean and 95 % interval over the seeds.
 
-    The close-up replays the recording up to a late detection that is typical of those that lower the error of the first
-    run's present; where the recording is not there any more it is left out.
+    The close-up replays the recording of the first run up to a typical late detection
+    that lowers the error of the present. It is left out if the recording does not exist
+    any more.
     """
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
         raise CallError(
-            f"{out}: one picture cannot hold all figures, name a folder or a .pdf"
+            f"{out}: a picture file cannot contain all figures, give a folder or a .pdf"
         )
     given = {"width": width, "font": font, "style": style}
     paper = cast(
         Paper, {name: value for name, value in given.items() if value is not None}
     )
-    settings(paper)  # raises where one is not usable
-    picture = (
-        out if one_file else out / f"figure.{form}"
-    )  # what else is in the folder stays
+    settings(paper)  # raises for an invalid option
+    # Other files in the folder stay.
+    picture = out if one_file else out / f"figure.{form}"
     with progress("draw"):
         sweeps = [folder for folder in runs if (folder / SWEEP_FILE).is_file()]
         if not sweeps:
@@ -86,7 +86,7 @@ def figure(
             first, plans, missing = [], planned_sweep(read_sweep(sweeps[0])), None
         else:
             raise CallError(
-                f"{sweeps[0]}: is a sweep, name it alone and without --stamp"
+                f"{sweeps[0]}: is a sweep, give it alone and without --stamp"
             )
         named = chain(first, drawn(plans, every, **paper))
         if one_file:
@@ -101,13 +101,13 @@ def figure(
     for path in files:
         say(path)
     if not every and any(one.is_extra for one in plans):
-        say(f"{sum(one.is_extra for one in plans)} more with --all")
+        say(f"{sum(one.is_extra for one in plans)} more figures with --all")
 
 
 def _of_runs(
     folders: Sequence[Path], out: Path, stamp: float | None, paper: Paper
 ) -> tuple[list[tuple[str, Figure]], list[Planned], DataError | None]:
-    """The close-up, the other figures, and why there is no close-up."""
+    """Return the close-up, the other figures, and the reason if there is no close-up."""
     result = evaluated(folders)
     check_no_overlap(out, [item.run.path for item in result])
     stamp_ns = None if stamp is None else start_ns(result) + nanoseconds(stamp)
@@ -125,9 +125,10 @@ def report(
 ) -> None:
     """Write one HTML file: verdict, viewer, figures, tables.
 
-    It opens with the verdict, a viewer that plays the runs, and three figures; all tables and figures and the
-    configuration are folded below. The file needs no network and no other file. Its close-up replays the recording;
-    where that is not there any more it is left out.
+    The page opens with the verdict, a viewer that plays the runs, and three figures.
+    Other tables and figures, and the configuration, are folded below. The page needs no
+    network and no other files. Its close-up replays the recording, and is left out if
+    the recording does not exist any more.
     """
     check_output(out, overwrite)
     every = evaluated(runs)
@@ -141,4 +142,4 @@ def report(
         size = write_report(
             every, compare(*every), pictures, out, head_at(late), overwrite
         )
-    say(f"{out}: {size / 1e6:.1f} MB, open it in a browser")
+    say(f"{out}: {size / 1e6:.1f} MB, open the file in a browser")

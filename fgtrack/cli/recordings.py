@@ -1,4 +1,4 @@
-"""`fgtrack simulate`, `convert` and `config`: recordings that are made, and the configuration of a replay."""
+"""`fgtrack simulate`, `convert` and `config`: writes recordings, and prints the configuration of a replay."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -39,14 +39,12 @@ def simulate(
     ],
     out: Annotated[
         Path,
-        Option(
-            "-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder."
-        ),
+        Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz) or rosbag2 folder."),
     ],
     seed: Seed = 0,
     duration_s: Annotated[
         float | None,
-        Option("--duration", help="Length [s], instead of the scenario's."),
+        Option("--duration", help="Duration [s], instead of the scenario's."),
     ] = None,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
@@ -67,13 +65,12 @@ def convert(
     recording: Input,
     out: Annotated[
         Path,
-        Argument(
-            metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder."
-        ),
+        Argument(metavar="OUT", help="Stream (.jsonl, .jsonl.gz) or rosbag2 folder."),
     ],
     config_file: ConfigFile = None,
     delays_file: Annotated[
-        Path | None, Option("--delays", help="Other delays, losses, clocks by sensor.")
+        Path | None,
+        Option("--delays", help="File with new delays, losses and clocks (YAML)."),
     ] = None,
     seed: Seed = 0,
     storage: StorageOption = "mcap",
@@ -86,7 +83,8 @@ def convert(
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
-        messages, lost = source.messages(), dict[str, int]()
+        messages = source.messages()
+        lost = dict[str, int]()
         if delays_file is not None:
             delays = load(dict[str, SensorDelays], delays_file)
             messages, lost = redelay(messages, delays, np.random.default_rng(seed))
@@ -105,7 +103,7 @@ def convert(
 def _with_unread(
     messages: Iterable[Message], unread: dict[str, Counter[str]]
 ) -> Iterator[Message]:
-    """Yield `messages`; counts of excluded detections are added to `unread`, by sensor and setting."""
+    """Yield `messages`, and add the counts of excluded detections to `unread`, by sensor and setting."""
     for message in messages:
         if isinstance(message, DetectionList) and message.left_out:
             unread.setdefault(message.sensor, Counter()).update(message.left_out)

@@ -1,4 +1,4 @@
-"""`fgtrack replay`: a recording through the tracker into a run folder."""
+"""`fgtrack replay`: runs a recording through the tracker into run folders."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,12 +37,15 @@ def replay(
     out: Annotated[
         Path,
         Option(
-            "-o", "--out", help="Run folder; for several estimators one below it each."
+            "-o",
+            "--out",
+            help="Run folder; several estimators: one subfolder for each.",
         ),
     ],
     config_file: ConfigFile = None,
     estimators: Annotated[
-        str | None, Option("-e", "--estimator", help="Names, with commas between them.")
+        str | None,
+        Option("-e", "--estimator", help="Names of estimators, separated by commas."),
     ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -85,9 +88,9 @@ def replay(
     for line in result.lines():
         say(line)
     for run in runs:
-        what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
-        say(f"{run.path}: {what.format_map(run.meta)}")
-    for line in excluded_lines(runs[0].meta):  # the same of all
+        summary = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
+        say(f"{run.path}: {summary.format_map(run.meta)}")
+    for line in excluded_lines(runs[0].meta):  # all runs exclude the same detections
         say(line)
     for line in dict.fromkeys(
         map(
@@ -99,11 +102,9 @@ def replay(
         )
     ):
         warn(line)
-    if (
-        broken := runs[0].meta["broken_off"]
-    ) is not None:  # the others break off at the same message
-        raise DataError(
-            f"{pipeline.located(broken, str(recording))}; replayed up to there"
-        )
+    # All runs break off at the same message.
+    if (broken := runs[0].meta["broken_off"]) is not None:
+        problem = pipeline.with_origin(broken, str(recording))
+        raise DataError(f"{problem}; the messages before are replayed")
     if (reason := unused(runs[0])) is not None:
         raise DataError(f"{recording}: {reason}")

@@ -1,4 +1,4 @@
-"""`fgtrack compare` and `export`: tables of runs, and runs for other programs."""
+"""`fgtrack compare` and `export`: tables of runs, and runs in formats of other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,16 +25,18 @@ def compare(
     everything: All = False,
     streaming: Annotated[
         bool,
-        Option("--streaming", help="Judge what was published when it was ready, too."),
+        Option(
+            "--streaming", help="Also judge each output from the time it was ready."
+        ),
     ] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     form = "json" if as_json else form
     every = evaluated(runs)
-    of_each = dict.fromkeys(
+    lines = dict.fromkeys(
         f"{one.label}: {line}" for one in every for line in diagnostics(one.run)
     )
-    for line in (*recordings_warning(every), *of_each):
+    for line in (*recordings_warning(every), *lines):
         warn(line)
     tables = tables_of(*every, streaming=streaming)
     for one in every:
@@ -42,10 +44,10 @@ def compare(
             try:
                 write_metrics(one.run.path, one.metrics.as_dict())
             except FgtrackError as error:
-                warn(f"{error}; the tables are complete without it")
+                warn(f"{error}; metrics.json is missing, the tables are complete")
     show(tables.in_full() if everything else tables, form)
     if form is None and not everything:
-        say("\nevery table and column: --all")
+        say("\nall tables and columns: --all")
 
 
 def export(
@@ -55,7 +57,7 @@ def export(
         Option(
             "-o",
             "--out",
-            help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.",
+            help="MCAP file (--ros2: or rosbag2 folder, --kitti: text file).",
         ),
     ],
     ros2: Annotated[
@@ -66,18 +68,21 @@ def export(
     ] = False,
     geojson: Annotated[
         bool,
-        Option("--geojson", help="Tracks in latitude and longitude: .geojson, .csv."),
+        Option(
+            "--geojson",
+            help="Write tracks in latitude and longitude (.geojson, .csv).",
+        ),
     ] = False,
     kitti: Annotated[
         Path | None,
-        Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt."),
+        Option(metavar="OXTS", help="Write a KITTI result for this oxts/NNNN.txt."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Export runs for Foxglove, Lichtblick, RViz, maps, KITTI."""
     if (kitti is not None or geojson) and len(runs) != 1:
         raise CallError(
-            f"--{'geojson' if geojson else 'kitti'}: writes one run, these are {len(runs)}"
+            f"--{'geojson' if geojson else 'kitti'}: exports a single run, but {len(runs)} are given"
         )
     if geojson:
         say(
@@ -90,7 +95,7 @@ def export(
         )
         if without_size:
             warn(
-                f"{without_size} tracks are left out: none of their detections has a size"
+                f"{without_size} tracks are left out, because none of their detections has a size"
             )
         say(f"{out}: {boxes} boxes of {tracks} tracks")
         return

@@ -1,4 +1,4 @@
-"""Output of commands: tables on stdout, progress on stderr where that is a terminal."""
+"""Output of the commands: tables on stdout, progress on stderr if stderr is a terminal."""
 
 import json
 import os
@@ -14,17 +14,18 @@ from fgtrack.core.errors import one_line, printable_lines
 from fgtrack.evaluation.tables import Table, Tables, bulleted
 
 _WIDTH_WITHOUT_TERMINAL = 120
-_SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
+#: Period from which the remaining time is estimated; it is long, because the jobs of a sweep differ.
+_SPEED_PERIOD_S = 600.0
 
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
-        """Print the rest nowhere (`| head`): what goes to files is written all the same."""
+        """Discard the remaining output (`| head`); files are still written."""
         sys.stdout = None
 
 
 def console() -> Console:
-    """Stdout; a file or a pipe is as wide as COLUMNS specifies, by default wide enough for nearly every table."""
+    """Console on stdout. A file or a pipe has the width COLUMNS, by default a width that fits nearly all tables."""
     probe = _Output()
     return (
         probe
@@ -34,7 +35,7 @@ def console() -> Console:
 
 
 def say(line: object) -> None:
-    """Print a line as it is, however long."""
+    """Print a line without wrapping."""
     console().out(printable_lines(str(line)), highlight=False)
 
 
@@ -44,7 +45,7 @@ def warn(line: str) -> None:
 
 
 def sentences(lines: Iterable[str]) -> None:
-    """Print sentences, each behind a dash, wrapped between words."""
+    """Print sentences as a list with dashes, wrapped between words."""
     for line in bulleted(lines, console().width):
         console().print(line)
 
@@ -52,18 +53,19 @@ def sentences(lines: Iterable[str]) -> None:
 def show(
     tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | None = None
 ) -> None:
-    """Print tables in a form; as JSON the `values`, which are those of the tables where none are given."""
+    """Print tables in the format `form`.
+
+    JSON prints `values`; without `values` it prints the contents of the tables.
+    """
     if form is None:
         console().print(tables)
     elif form == "json":
-        result = (
-            values
-            if values is not None
-            else tables.to_dict()
-            if isinstance(tables, Tables)
-            else tables.plain()
-        )
-        say(json.dumps(result, indent=2, allow_nan=False))
+        contents: object = values
+        if values is None:
+            contents = (
+                tables.to_dict() if isinstance(tables, Tables) else tables.plain()
+            )
+        say(json.dumps(contents, indent=2, allow_nan=False))
     else:
         text = {
             "md": tables.to_markdown,
@@ -75,7 +77,11 @@ def show(
 
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A bar on a terminal while the block runs; the function given sets its text after each step or with the share."""
+    """Show a progress bar during the block, if stderr is a terminal.
+
+    Yields a function that advances the bar: `moved(text)` by one step, `moved(text,
+    share)` to a share from 0 to 1.
+    """
     stderr = Console(stderr=True)
     if not stderr.is_terminal:
         yield lambda *_, **__: None

@@ -1,4 +1,4 @@
-"""`fgtrack study` and `demo`: from a recording, or a simulated race, to a page in one command."""
+"""`fgtrack study` and `demo`: from a recording, or a simulated race, to a report in one command."""
 
 import shlex
 from dataclasses import replace
@@ -25,7 +25,7 @@ from fgtrack.core.output import check_no_overlap, locked_folder
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
-from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.replay import with_origin
 from fgtrack.recording_study import Study, outputs
 from fgtrack.recording_study import study as studied
 from fgtrack.show.figures.plot import error_against_delay
@@ -46,8 +46,8 @@ def study(
 ) -> None:
     """Advise, replay with three estimators, compare, report.
 
-    No configuration is needed: what is assumed is printed with its reason, and written to settings.yaml, to be changed
-    and run again.
+    No configuration is needed. Assumptions are printed with their reasons, and written
+    to settings.yaml. Change this file and run the command again.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     for path in outputs(out):
@@ -62,7 +62,7 @@ def study(
 
 
 def show_study(found: Study, recording: Path) -> None:
-    """Print a study. Raises `DataError` where the recording breaks off."""
+    """Print a study; raises `DataError` if the recording breaks off."""
     sentences(found.summary)
     show(replace(found.tables, verdict=()), None)
     say("")
@@ -71,10 +71,11 @@ def show_study(found: Study, recording: Path) -> None:
     again = shlex.join(
         ["fgtrack", "study", str(recording), "-c", str(found.settings), "-o", "OTHER"]
     )
-    say(f"settings: {found.settings}; change them and run again by `{again}`")
-    say(f"report: {found.report}, open it in a browser")
+    say(f"settings: {found.settings}; change the file and run `{again}`")
+    say(f"report: {found.report}, open the file in a browser")
     if found.broken is not None:
-        raise DataError(f"{located(found.broken, str(recording))}; used up to there")
+        problem = with_origin(found.broken, str(recording))
+        raise DataError(f"{problem}; the messages before are used")
 
 
 def demo(
@@ -108,9 +109,9 @@ def demo(
             on_step=tell,
         )
     say(
-        f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c tuned):"
+        f"{scenario.duration_s:g} s of a simulated race ({bag}), with noise tuned on other races (-c tuned):"
     )
     show_study(result, bag)
     say(
-        f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}"
+        f"error against delay, from a sweep over ten races: {out / 'figures/error_against_delay.png'}"
     )

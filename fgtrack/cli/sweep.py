@@ -1,4 +1,4 @@
-"""`fgtrack sweep`: settings x seeds x estimators into one table."""
+"""`fgtrack sweep`: runs settings x seeds x estimators into one table."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ from fgtrack.pipeline.sweep import (
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.runs import Run
 
-#: Wall times among the metrics, and what follows from them; they have a table of their own.
+#: Prefix of the metrics that are wall times; they have their own table.
 _TIMES = "time_per_"
 
 
@@ -43,17 +43,20 @@ def sweep(
     ],
     out: Annotated[
         Path,
-        Option("-o", "--out", help="Folder of the tables; what is done there is kept."),
+        Option("-o", "--out", help="Folder of the tables; finished jobs are kept."),
     ],
     jobs: Annotated[
-        int | None, Option(min=1, help="Processes, by default one for each core.")
+        int | None,
+        Option(min=1, help="Number of processes; default: one for each core."),
     ] = None,
     dask: Annotated[
-        str | None, Option(metavar="ADDRESS", help="Cluster of dask to run on.")
+        str | None, Option(metavar="ADDRESS", help="Address of a dask cluster.")
     ] = None,
     recording: Annotated[
         Path | None,
-        Option("--input", metavar="INPUT", help="Instead of the sweep's input."),
+        Option(
+            "--input", metavar="INPUT", help="Recording to use instead of the sweep's."
+        ),
     ] = None,
     settings: Settings = None,
     form: FormOption = None,
@@ -62,16 +65,17 @@ def sweep(
 ) -> None:
     """Run settings x seeds x estimators into one table; resumes.
 
-    Ends with mean and standard error at each point of the grid, and who is better.
+    Prints the mean and the standard error at each point of the grid, and which
+    estimators are better.
     """
     tell = say if form is None else lambda line: None
     sweep_file = find_file("sweep", sweep_name)
     plan = load_plan(sweep_file, recording, settings or ())
-    for name in PRODUCTS:  # what else is in the folder stays
+    for name in PRODUCTS:  # other files in the folder stay
         check_no_overlap(out / name, plan.inputs)
     work = Sweep.open(plan, out, overwrite)
     tell(
-        f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {len(work.todo)}"
+        f"jobs: {len(work.plan.jobs)} with {len(work.plan.estimators)} estimators each; to do: {len(work.todo)}"
     )
     with progress("sweep", len(work.todo)) as moved:
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=moved)
@@ -82,20 +86,22 @@ def sweep(
         _summarise(read_sweep(out), out, form, everything)
     if result.errors:
         raise DataError(
-            f"{out / ERROR_TABLE}: {len(result.errors)} bad cells, the first: {result.errors[0]}"
+            f"{out / ERROR_TABLE}: {len(result.errors)} cells failed, the first: {result.errors[0]}"
         )
-    if (
-        result.unknown_metrics and recording is None
-    ):  # the metrics were not chosen for another input
+    # With --input, the sweep's metrics were chosen for another recording.
+    if result.unknown_metrics and recording is None:
         raise DataError(
-            f"{sweep_file}: metrics: no column of {SWEEP_TABLE} fits {', '.join(result.unknown_metrics)}"
+            f"{sweep_file}: metrics: {SWEEP_TABLE} has no columns for {', '.join(result.unknown_metrics)}"
         )
 
 
 def swept(
     sweep_file: Path, out: Path, num_seeds: int | None = None
 ) -> list[dict[str, str]]:
-    """Rows of the table in `out`, for scripts; the sweep is run first (of `num_seeds` seeds) where there is none."""
+    """Return the rows of the table in `out`, for scripts; if there is no table, the sweep is run first.
+
+    The first `num_seeds` seeds are run, by default all.
+    """
     if not (out / SWEEP_TABLE).exists():
         plan = load_plan(sweep_file)
         jobs = tuple(
@@ -111,7 +117,7 @@ def swept(
 def _summarise(
     table: SweepTable, out: Path, form: Form | None, everything: bool
 ) -> None:
-    """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
+    """Write means and paired differences of the estimators; print the means, and the differences in one metric."""
     comparisons = seed_comparisons(table)
     differences = difference_table(comparisons, table.axes)
     write_file(out / PAIRED_TABLE, differences.to_csv())
@@ -121,11 +127,11 @@ def _summarise(
         show(differences, form)
     show(summary.in_full() if everything else summary, form)
     if form is None and not everything:
-        say(f"\nevery metric: --all, {out / SUMMARY_TABLE}, {out / PAIRED_TABLE}")
+        say(f"\nall metrics: --all, {out / SUMMARY_TABLE}, {out / PAIRED_TABLE}")
 
 
 def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
-    """Return all scalars of the metrics of `run` by path, and its wall times."""
+    """Return all scalar metrics of `run` by path, and its wall times."""
     scalars = {
         name: value
         for name, value in _scalars(evaluate(run).as_dict(), "")
@@ -136,7 +142,7 @@ def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
 
 
 def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
-    """Path and value of every scalar; entries of a list with a lag are named by it."""
+    """Yield path and value of every scalar; an entry of a list is named by its lag, else by its index."""
     if isinstance(value, Mapping):
         for name, entry in value.items():
             yield from _scalars(entry, f"{path}.{name}" if path else name)

@@ -1,4 +1,4 @@
-"""`fgtrack tune`: process and measurement noise from recordings."""
+"""`fgtrack tune`: fits process and measurement noise to recordings."""
 
 import math
 from collections.abc import Sequence
@@ -27,6 +27,7 @@ from fgtrack.noise.parameters import HeldOut, TunedParameter, TuneReport, TuneRu
 from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.assumptions.assumption import Assumed
 
+#: Words for `TunedParameter.known`.
 _KNOWN = {
     "yes": "yes",
     "roughly": "roughly",
@@ -48,14 +49,15 @@ def tune(
     settings: Settings = None,
     keep: Annotated[
         list[str] | None,
-        Option(metavar="KEY", help="Leave this key as configured; repeatable."),
+        Option(metavar="KEY", help="Do not fit this configuration key; repeatable."),
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Fit process and measurement noise to recordings.
 
-    Maximum likelihood of the innovations; truth is not needed. Reports which parameters are not identifiable.
+    Maximises the likelihood of the innovations; truth is not needed. Reports parameters
+    that are not identifiable.
     """
     check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
@@ -67,17 +69,17 @@ def tune(
     if report.held_out is not None:
         shown["held_out"] = _validation(report.held_out)
     tables, result = Tables(shown), _sensors(report)
-    of_recordings = replace(
-        report.config, map=read_config(config_file).map
-    )  # the maps belong to these
-    title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
+    # Maps from the command line belong to these recordings, so the output does not contain them.
+    tuned_config = replace(report.config, map=read_config(config_file).map)
+    title = f"Noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
     head = [title, "", *str(tables).splitlines(), "", *result, ""]
-    write_file(out, Assumed(of_recordings, ()).to_yaml(head), overwrite)
+    write_file(out, Assumed(tuned_config, ()).to_yaml(head), overwrite)
     show(tables, "json" if as_json else None, report.as_dict())
     if not as_json:
         say("\n".join(["", *result, f"{out}: written"]))
     if report.broken:
-        raise DataError(f"{next(iter(report.broken.values()))}; used up to there")
+        problem = next(iter(report.broken.values()))
+        raise DataError(f"{problem}; the messages before are used")
 
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:
@@ -107,7 +109,7 @@ def _four_digits(value: Value) -> str:
 
 
 def _short(key: Value) -> str:
-    """A key of the configuration without what all have in common."""
+    """Configuration key without the parts that all keys share."""
     return (
         str(key)
         .removeprefix("sensors.")
@@ -126,20 +128,21 @@ def _sensors(report: TuneReport) -> list[str]:
             )
         if one.own_covariance:
             lines.append(
-                f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own, which stays"
+                f"{one.sensor}: {one.own_covariance} measurements report their covariance, which is not fitted"
             )
     lines += [
-        f"{one.sensor}: innovations still correlated in time (autocorrelation {one.lag1:.2f}): so are errors, of it or "
-        "of the sensor that is trusted more, and white noise is too small for them"
+        f"{one.sensor}: innovations remain correlated in time (autocorrelation {one.lag1:.2f}), so white noise is too "
+        "small: model time-correlated errors of this sensor, or of the most accurate sensor"
         for run in report.runs
         for one in noise_fits(run)
         if one.is_correlated
     ]
-    settled = "" if report.settled else ", not settled"
+    settled = "" if report.settled else ", not converged"
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")
     if report.num_mixed:
         lines.append(
-            f"{report.num_mixed} measurements left out: most around them are outliers (an exchanged object?)"
+            f"{report.num_mixed} measurements are left out: most measurements around them are outliers "
+            "(is the track on another object?)"
         )
     return lines
 
@@ -164,7 +167,9 @@ def _validation(held_out: HeldOut) -> Table:
         Column("95 %", "band", "± {}"),
     ]
     share = f"the last {100.0 * held_out.share:.0f} % of the time"
-    title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
+    title = (
+        f"Validation on {share}: {held_out.count} innovations, noise fitted to the rest"
+    )
     notes = [
         f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"
     ]

@@ -1,4 +1,4 @@
-"""`fgtrack verify`: the contract suites over estimators, motion models and measurement models."""
+"""`fgtrack verify`: runs the contract suites over estimators, motion models and measurement models."""
 
 from typing import Annotated
 
@@ -30,14 +30,15 @@ _COLUMNS = (
 def verify(
     as_json: Json = False,
     name: Annotated[
-        str | None, Option("-e", "--estimator", help="This one alone.")
+        str | None, Option("-e", "--estimator", help="Check only this estimator.")
     ] = None,
 ) -> None:
     """Check the contract of estimators, in any order of arrival.
 
-    All estimators and motion models that are installed, plug-ins included, and all measured components, against plain
-    calculations. Shipped models are compared with their differential equations and definitions, entry by entry. Exit
-    code 1 where a promise is broken.
+    Checks all installed estimators and motion models, plug-ins included, and all
+    measured components. Estimators are compared with direct calculations, shipped
+    models with their differential equations and definitions. Exit code 1 if a promise
+    is broken.
     """
     names = list(ESTIMATORS.loaded()) if name is None else [ESTIMATORS.resolve(name)]
     broken: dict[str, dict[str, str]] = {}
@@ -89,11 +90,11 @@ def verify(
     show(table, "json" if as_json else None, values)
     if not as_json:
         for each, result in broken.items():
-            for promise, what in result.items():
-                say(f"{each}: broken promise: it {promise}\n{what}\n")
+            for promise, fault in result.items():
+                say(f"{each}: broken promise: it {promise}\n{fault}\n")
     if broken:
         raise DataError(
-            f"{sum(map(len, broken.values()))} of {promises} promises broken"
+            f"{sum(map(len, broken.values()))} of {promises} promises are broken"
         )
     if not as_json:
-        say(f"all {promises} promises kept")
+        say(f"all {promises} promises are kept")

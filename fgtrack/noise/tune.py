@@ -32,7 +32,7 @@ from fgtrack.noise.parameters import (
 )
 from fgtrack.noise.stamps import StampFit, fitted_stamps, stamp_rates, with_stamps
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.replay import with_origin
 from fgtrack.runs import Run
 
 # Least number of observations of a track. Most shorter tracks are clutter.
@@ -102,7 +102,7 @@ def tune_sources(
         readable = UntilBreak(source.messages())
         messages[name] = list(readable)
         if readable.error is not None:
-            broken[name] = located(str(readable.error), name)
+            broken[name] = with_origin(str(readable.error), name)
             if not messages[name]:
                 readable.raise_error()
     together = replace(

@@ -1,1 +1,1 @@
-"""From a configuration and an input to run folders."""
+"""From a configuration and an input to a run: replay, live tracking, sweeps, and assumptions about recordings."""

@@ -1,4 +1,4 @@
-"""Time in a replay: stamps corrected for the clocks of sensors, and the ticks of the node."""
+"""Time in a replay: corrected stamps of sensors, and ticks of the node."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -13,15 +13,17 @@ Delivered = EgoState | DetectionList
 
 
 class Tick(NamedTuple):
-    """A tick and what arrived since the one before."""
+    """A tick and the messages since the previous tick."""
 
     now_ns: int
     messages: list[Delivered]
 
 
 def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterator[Tick]:
-    """Yield ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
-    Messages received at or before a tick are delivered with it. Without `node_hz` every receipt is a tick.
+    """Yield ticks at multiples of the node period, from the first receipt until all messages are delivered.
+
+    Messages received at or before a tick are delivered with it. Without `node_hz` every
+    distinct receipt is a tick.
     """
     step_ns = 1 if node_hz is None else period_ns(node_hz)
     next_ns: int | None = None
@@ -36,7 +38,7 @@ def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterato
 
 
 def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
-    """Yield each of `ticks`, and True with the last one."""
+    """Yield each tick, with True for the last one."""
     before: Tick | None = None
     for tick in ticks:
         if before is not None:
@@ -49,7 +51,10 @@ def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
 def corrected(
     message: DetectionList, sensors: Mapping[str, SensorModel]
 ) -> DetectionList:
-    """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` specify it."""
+    """Return `message` with the stamp that `sensors` specifies: its receipt, or its stamp minus the clock offset.
+
+    A clock offset is also subtracted from the receipt.
+    """
     sensor = sensors.get(message.sensor)
     if sensor is None or (
         sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0

@@ -1,4 +1,4 @@
-"""Replay and simulation in one call each, as `fgtrack.replay` and `fgtrack.simulate`."""
+"""Replay and simulation as functions: `fgtrack.replay` and `fgtrack.simulate`."""
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -33,27 +33,29 @@ def replay(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Run:
-    """Return the run that the command `fgtrack replay` writes.
+    """Replay a recording and return the run, which equals the run of the command `fgtrack replay`.
 
-    A recording that breaks off is replayed up to the break, with a `UserWarning`, the reason in `meta["broken_off"]`.
+    If the recording breaks off, the messages before the break are replayed. Then a
+    `UserWarning` is issued, and `meta["broken_off"]` contains the reason.
 
     Parameters
     ----------
     recording
-        Path of anything that fgtrack reads, or messages in the order of their receipt.
+        Path of a recording, or messages in the order of their receipt.
     config
-        Name of a shipped configuration, path of a YAML file, a `Config` or a mapping as `run.config`; None for the
-        defaults.
+        Name of a shipped configuration, path of a YAML file, a `Config`, or a mapping such as `run.config`. None stands
+        for the defaults.
     map, pit_map
         CSV files of the track and of the pit lane, or `oval`.
     estimator
         Name of the estimator.
     set
-        Values of single settings: `{"smoother.lag_s": 3.0}`. All four replace those of the configuration.
+        Values of single settings: `{"smoother.lag_s": 3.0}`. This argument and the three before replace settings of
+        `config`.
     out
-        Folder to write the run to; None keeps it in memory.
+        Folder for the run; None keeps the run in memory.
     overwrite
-        True to replace a run in `out`.
+        True to replace an existing run in `out`.
     """
     resolved = read_config(
         config, set, track_map=map, pit_map=pit_map, estimator=estimator
@@ -78,13 +80,14 @@ def replay(
         run = load_run(out)
     if (broken := run.meta["broken_off"]) is not None:
         warnings.warn(
-            f"the input broke off, replayed up to there: {broken}", stacklevel=2
+            f"the input broke off, and the messages before are replayed: {broken}",
+            stacklevel=2,
         )
     return run
 
 
 def _messages(recording: Iterable[Message]) -> Iterator[Message]:
-    """Yield the messages of `recording`. Raises `CallError` for other objects."""
+    """Yield the messages of `recording`; raises `CallError` for other objects."""
     if not isinstance(recording, Iterable):
         raise CallError(
             f"recording: must be a path or messages, is a {type(recording).__name__}"
@@ -127,26 +130,28 @@ def simulate(
     storage: Storage = "mcap",
     overwrite: bool = False,
 ) -> Iterator[Message] | Path:
-    """Return the messages of a simulated scenario in the order of their receipt, or the path of the recording written.
+    """Simulate a scenario and return its messages in the order of receipt.
+
+    With `out`, the messages are written to a recording, whose path is returned.
 
     Parameters
     ----------
     scenario
         Name of a shipped scenario, path of a YAML file, or a `Scenario`.
     seed
-        Of the random generator; the same seed gives the same bits.
+        Seed of the random generator; the same seed gives the same bits.
     duration_s
-        Length, instead of the scenario's.
+        Duration, instead of the scenario's.
     out
-        Stream (`.jsonl`, `.jsonl.gz`), else a rosbag2 folder; None gives the messages.
+        Stream (`.jsonl`, `.jsonl.gz`) or rosbag2 folder to write; None returns the messages.
     storage
         Storage of a rosbag2 folder.
     overwrite
-        True to replace a recording at `out`.
+        True to replace an existing recording at `out`.
     """
     check_paths(out=out)
     if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise CallError(f"seed: must be an integer of 0 or more, is {seed!r}")
+        raise CallError(f"seed: must be a non-negative integer, is {seed!r}")
     if out is not None:
         check_recording(Path(out), overwrite)
     resolved = read_scenario(scenario, duration_s=duration_s)

@@ -1,4 +1,4 @@
-"""Replay: messages in receipt order through a tracker into a run folder."""
+"""Replay: runs messages in receipt order through a tracker, into a run."""
 
 import importlib.metadata
 import platform
@@ -21,23 +21,30 @@ from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with
 from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
-#: Ticks go on while nothing is received: a few messages must not make a recording of days.
+#: Longest gap between receipts. Ticks continue during a gap, so a wrong receipt could cause ticks for days.
 _LONGEST_SILENCE_S = 3600.0
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
 class Feed:
-    """Messages with corrected stamps, without ignored sensors, up to the break of the input or an invalid message."""
+    """Iterator over the messages for the tracker: stamps are corrected, and ignored sensors left out.
+
+    It ends at a break of the input or at an invalid message; `broken` then contains the
+    reason. The attributes count the messages up to now.
+    """
 
     def __init__(self, messages: Iterable[Message], config: Config) -> None:
-        self._messages, self._config = messages, config
+        self._messages = messages
+        self._config = config
         self.broken: str | None = None
-        self.num_messages = self.ignored_detections = 0
+        self.num_messages = 0
+        self.ignored_detections = 0
         self.first_receipt_ns: int | None = None
         self.last_receipt_ns: int | None = None
 
     def __iter__(self) -> Iterator[Message]:
-        ignored, sensors = frozenset(self._config.ignore_sensors), self._config.sensors
+        ignored = frozenset(self._config.ignore_sensors)
+        sensors = self._config.sensors
         try:
             for message in self._messages:
                 self.num_messages += 1
@@ -54,7 +61,7 @@ class Feed:
             self.broken = str(error)
 
     def _check_receipt(self, receipt_ns: int) -> None:
-        """Receipts never go back and leave no gap of hours."""
+        """Raise `DataError` if the receipt goes back, or follows after a gap of more than an hour."""
         if self.first_receipt_ns is None or self.last_receipt_ns is None:
             self.first_receipt_ns = self.last_receipt_ns = receipt_ns
         gap_s = seconds(receipt_ns - self.last_receipt_ns)
@@ -80,19 +87,23 @@ def replay(
     overwrite: bool = False,
     observed: Mapping[str, Callable[[TrackerParts], TrackerParts]] | None = None,
 ) -> list[dict[str, object]]:
-    """Run each estimator of `folders` over the messages into its run folder; return the contents of their meta.json.
-    `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data has the reason.
-    `origin` and `kind` are path and format of the input; `observed` is that of `build_tracker`, by estimator. Raises
-    `DataError` for an input without messages for the tracker.
+    """Run each estimator in `folders` over the messages into its run folder; return the contents of each meta.json.
+
+    `messages` returns an iterator in receipt order. If the iterator raises `DataError`,
+    the run ends there, and `broken_off` in the meta data contains the reason. `origin`
+    and `kind` are path and format of the input. `observed` is the argument of
+    `build_tracker`, by estimator.
+
+    Raises `DataError` for an input without messages for the tracker.
     """
     config = assumed(config, source_of(messages)).config
-    with ExitStack() as claims:
+    with ExitStack() as stack:
         runs = []
         for estimator, folder in folders.items():
             chosen = replace(config, estimator=estimator)
             tracker = build_tracker(chosen, (observed or {}).get(estimator))
             writer = RunWriter(folder, *_head(chosen, origin, kind, folder), overwrite)
-            runs.append((chosen, tracker, claims.enter_context(writer)))
+            runs.append((chosen, tracker, stack.enter_context(writer)))
         return [
             _drive(tracker, messages(), chosen, writer, origin, on_tick)
             for chosen, tracker, writer in runs
@@ -107,7 +118,10 @@ def replay_in_memory(
     kind: str = "",
     observed: Callable[[TrackerParts], TrackerParts] | None = None,
 ) -> Run:
-    """Return the run that `replay` would write, faster; `observed` is that of `build_tracker`. Raises as `replay`."""
+    """Return the run that `replay` would write, without writing files; `observed` as in `build_tracker`.
+
+    Raises as `replay`.
+    """
     repeated = repeatable(messages, config)
     config = assumed(config, source_of(repeated)).config
     tracker = build_tracker(config, observed)
@@ -119,7 +133,11 @@ def replay_in_memory(
 def repeatable(
     messages: Iterable[Message], config: Config
 ) -> Callable[[], Iterable[Message]]:
-    """Return a function that gives `messages`, which are kept if they are needed twice, as `config` is open."""
+    """Return a function that returns `messages`.
+
+    The messages are kept in memory if assumptions must be made about them before the
+    replay (`is_open`).
+    """
     if not is_open(config):
         return lambda: messages
     readable = UntilBreak(messages)
@@ -172,7 +190,9 @@ def _drive(
         on_tick(report)
     if feed.last_receipt_ns is None:
         raise DataError(
-            located(feed.broken or "holds neither ego states nor detections", origin)
+            with_origin(
+                feed.broken or "contains neither ego states nor detections", origin
+            )
         )
     writer.write_smoothed(tracker.finish())
     meta = {
@@ -197,7 +217,7 @@ def _drive(
 def _head(
     config: Config, origin: str, kind: str, folder: Path | None = None
 ) -> tuple[str, dict[str, object], float | None]:
-    """Return the head of a run in `folder`: text of its configuration, meta data, lag of its smoothed states."""
+    """Return the configuration as text, the meta data, and the lag of the smoothed states, for the start of a run."""
     source = {"path": origin, "kind": kind}
     if folder is not None and (relative := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = relative
@@ -213,14 +233,14 @@ def _head(
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 
-def located(problem: str, origin: str) -> str:
-    """Return `problem` as a line that names the input `origin`."""
+def with_origin(problem: str, origin: str) -> str:
+    """Return `problem` on one line, with the name of the input in front unless the problem contains the name."""
     line = " ".join(problem.split())
     return line if origin in line else f"{origin}: {line}"
 
 
 def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
-    """Return the ticks of a replay of `messages` with `config`, and the messages of each."""
+    """Yield the ticks of a replay of `messages` with `config`, with the messages of each tick."""
     of_tracker = (
         message
         for message in Feed(messages, config)
@@ -231,7 +251,7 @@ def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the version of each package on which results depend."""
+    """Return the version of each package that influences results."""
     return {"python": platform.python_version()} | {
         name: importlib.metadata.version(name) for name in _PACKAGES
     }

@@ -1,4 +1,4 @@
-"""Sweeps: the jobs of a plan on all cores or a cluster, every finished one kept at once, and tables of the results."""
+"""Sweeps: runs the jobs of a plan on all cores or on a cluster, stores each finished job, and writes tables."""
 
 import fnmatch
 import importlib
@@ -39,26 +39,29 @@ _PARTS = "parts"
 _TABLES = (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE)
 PRODUCTS = (*_TABLES, _PARTS)
 _SCHEDULER_TIMEOUT_S = 10
-_WATCH_S = 1.0  # how often a process checks that its sweep still runs
-_HANDED_OUT = 2  # jobs per process that are handed out at a time
+#: Period in which a worker process checks that the sweep is still running.
+_WATCH_S = 1.0
+#: Jobs that are dispatched ahead for each process.
+_HANDED_OUT = 2
 _logger = logging.getLogger(__name__)
 
 Scalar = str | bool | int | float | None
-#: Returns reproducible metrics of a run and its wall times, by column; a function that other processes can import.
+#: Function that returns reproducible metrics and wall times of a run, by column. Other processes must be able to import
+#: the function.
 Score = Callable[[Run], tuple[Mapping[str, Scalar], Mapping[str, Scalar]]]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One estimator on the stream of one job."""
+    """Result of one estimator in one job."""
 
     estimator: str
     values: Mapping[str, Scalar]
-    """Metrics."""
+    """Metrics by column."""
     times: Mapping[str, Scalar]
-    """Wall times."""
+    """Wall times by column."""
     error: str | None = None
-    """Why there is no result, in a line."""
+    """Reason on one line if there is no result, else None."""
 
 
 _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="forbid"))
@@ -66,19 +69,19 @@ _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="for
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Summary of the tables of a sweep."""
+    """Summary of the tables that a sweep has written."""
 
     num_good: int
-    """Cells with metrics."""
+    """Number of cells with metrics."""
     errors: tuple[str, ...]
-    """Reasons of the bad cells."""
+    """Reasons of the failed cells."""
     unknown_metrics: tuple[str, ...]
-    """The plan's metrics that match no column."""
+    """Metrics of the plan that match no column."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A plan and the folder for its results, in which some jobs may be finished already."""
+    """A plan, and the folder for its results, which may contain finished jobs of an earlier run."""
 
     plan: Plan
     folder: Path
@@ -87,7 +90,11 @@ class Sweep:
 
     @classmethod
     def open(cls, plan: Plan, folder: Path, overwrite: bool = False) -> "Sweep":
-        """Return the sweep `plan` in `folder`. Raises `CallError` for tables without parts, unless `overwrite`."""
+        """Return the sweep `plan` in `folder`.
+
+        Raises `CallError` if the folder contains tables but no finished jobs, unless
+        `overwrite` is true.
+        """
         parts = {path.stem: path for path in (folder / _PARTS).glob("*.json")}
         for name in _TABLES:
             check_output(folder / name, overwrite or bool(parts))
@@ -101,7 +108,11 @@ class Sweep:
 
     @property
     def todo(self) -> list[Job]:
-        """Jobs without a result or with a bad cell; an interrupted sweep covers the grid, as the first seed leads."""
+        """Jobs without a result, or with a failed cell.
+
+        They are ordered by seed, so an interrupted sweep covers the whole grid with the
+        first seeds.
+        """
         good = {
             key
             for key, cells in self.done.items()
@@ -123,9 +134,11 @@ class Sweep:
         dask: str | None = None,
         on_job: Callable[[], None] = lambda: None,
     ) -> SweepResult:
-        """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
-        `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler to use
-        instead. Raises `CallError` without dask or scheduler, `DataError` where a process dies.
+        """Run the remaining jobs, store each finished job, and write the tables, even if interrupted.
+
+        `jobs` is the number of processes, -1 means one for each core. `dask` is the
+        address of a scheduler to use instead. Raises `CallError` if dask or the
+        scheduler is missing, `DataError` if a process dies.
         """
         tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
         with locked_folder(self.folder):
@@ -148,11 +161,11 @@ class Sweep:
 
 
 def _read_part(path: Path) -> tuple[Cell, ...]:
-    """Return the cells of a job; none of a damaged file, with a warning."""
+    """Return the cells of a finished job; a damaged file gives a warning and no cells."""
     try:
         return _CELLS.validate_json(path.read_bytes())
     except (OSError, ValueError):
-        _logger.warning("%s: is damaged, its job is repeated", path)
+        _logger.warning("%s: is damaged, so its job is repeated", path)
         return ()
 
 
@@ -204,19 +217,17 @@ def write_tables(
 
 
 def _text(value: Value) -> str:
-    """Text of a cell: floats with all digits, lists and mappings as JSON."""
+    """Text of a table cell: floats with all digits, lists and mappings as JSON."""
     if value is None or isinstance(value, str):
         return value or ""
     return repr(value) if isinstance(value, float) else compact(value)
 
 
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
-    """Return the cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
+    """Return key and cells of a job; an exception becomes the error of a cell."""
     try:
-        config, rng = (
-            validate(Config, recipe["config"], "config"),
-            np.random.default_rng(recipe["seed"]),
-        )
+        config = validate(Config, recipe["config"], "config")
+        rng = np.random.default_rng(recipe["seed"])
         if recipe["recording"] is None:
             messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
         else:
@@ -230,10 +241,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
             config = assumed(
                 config, replace(source, messages=lambda: iter(messages))
             ).config
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # whatever is wrong with one job out of hundreds
+    except (Exception, SystemExit) as error:  # one failed job must not end the sweep
         return key, [
             Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]
         ]
@@ -255,7 +263,7 @@ def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
 
 
 def _reason(error: BaseException) -> str:
-    """Return the message of an error in a line, of a bug with its type."""
+    """Message of an error on one line; the error's type is added if it is a bug."""
     text = " ".join(str(error).split())
     return (
         text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
@@ -266,8 +274,8 @@ _Result = tuple[str, Sequence[Cell]]
 
 
 def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Result]:
-    """Yield results of processes of this machine, as they come."""
-    # With several jobs at once, threads of BLAS would only wait for each other.
+    """Yield results from processes on this machine, as they finish."""
+    # With several processes, several BLAS threads in each would only wait for each other.
     settings = {
         "inner_max_num_threads": 1,
         "initializer": _end_with_parent,
@@ -280,7 +288,10 @@ def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Re
 
 
 def _end_with_parent(parent: int) -> None:
-    """End this process soon after its parent; when that was killed, joblib would let it wait for work for ever."""
+    """End this process soon after its parent ends.
+
+    Without this, joblib's workers would wait for ever for jobs of a killed parent.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -293,7 +304,7 @@ def _end_with_parent(parent: int) -> None:
 def _on_cluster(
     tasks: Mapping[str, Recipe], score: Score, address: str
 ) -> Iterator[_Result]:
-    """Yield results of the workers of a dask cluster, as they come."""
+    """Yield results from the workers of a dask cluster, as they finish."""
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
@@ -301,9 +312,8 @@ def _on_cluster(
             "--dask needs the extra `dask`: pip install 'fgtrack[dask]'"
         ) from error
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(
-            logging.CRITICAL
-        )  # failures are raised below, in a line
+        # Failures are raised below, on one line.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=_SCHEDULER_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -318,16 +328,16 @@ def _on_cluster(
 
 
 def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
-    """Yield results of the tasks in the backend of joblib that is set, as they come."""
+    """Yield results of the tasks from the selected joblib backend, as they finish."""
     parallel = joblib.Parallel(
         return_as="generator_unordered",
         batch_size=1,
         pre_dispatch=f"{_HANDED_OUT}*n_jobs",
     )
-    resource_tracker.ensure_running()  # started below, it would let interrupts through
-    before = signal.pthread_sigmask(
-        signal.SIG_BLOCK, {signal.SIGINT}
-    )  # Ctrl-C is for this process, not for workers
+    # The resource tracker must be running before interrupts are blocked, because it unblocks them when it starts.
+    resource_tracker.ensure_running()
+    # Ctrl-C must reach this process only. The workers inherit the blocked signal.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         results: Generator[_Result] = parallel(
             joblib.delayed(run_job)(*task, score) for task in tasks.items()
@@ -336,10 +346,10 @@ def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         yield from results
-    except Exception as error:  # of a process, a scheduler or a network; the jobs report their own errors
-        what = f"the workers failed, perhaps out of memory ({_reason(error):.120})"
+    except Exception as error:  # jobs report their own errors, so a process, the scheduler or the network failed
         raise DataError(
-            f"{what}: rerun the sweep to continue, or with fewer --jobs"
+            f"the workers failed, perhaps out of memory ({_reason(error):.120}): "
+            "run the sweep once more to continue, perhaps with fewer --jobs"
         ) from error
     finally:
         with warnings.catch_warnings():  # an interrupt is reported once, in one line

@@ -1,4 +1,4 @@
-"""From a sweep file `fgtrack-sweep/1` to jobs: one for each point of the grid and each seed."""
+"""Plans a sweep: from a sweep file `fgtrack-sweep/1` to jobs, one for each point of the grid and each seed."""
 
 import hashlib
 import itertools
@@ -32,15 +32,18 @@ from fgtrack.pipeline.replay import versions
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
-#: Value of a key: JSON, which is validated by the dataclass that has the key.
+#: Value of a key: JSON values, which the dataclass with this key validates.
 Value = Any
-#: Columns of every table of a sweep behind those of its axes.
+#: Columns of every table of a sweep after the columns of the axes.
 KEY_COLUMNS = ("seed", "estimator")
-#: Key of a group of keys that names its values, in a column of the group's own name.
+#: Key in a group of keys that contains names for the group's values; the names are in the column of the group.
 LABEL = "label"
-_MOST_JOBS = 100_000  # more are a slip of the pen
-#: Roots of keys; those of the configuration have none.
-CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
+#: Most jobs of a sweep; more are probably a mistake in the file.
+_MOST_JOBS = 100_000
+#: First names of the keys; keys of the configuration are written without it.
+CONFIG = "config"
+SCENARIO = "scenario"
+DELAYS = "delays"
 _KINDS: Mapping[str, Any] = {
     CONFIG: Config,
     SCENARIO: Scenario,
@@ -49,83 +52,81 @@ _KINDS: Mapping[str, Any] = {
 
 
 class Point(NamedTuple):
-    """A point of the grid, or of one of its axes: cells by column, and values of the changed keys."""
+    """A point of the grid, or of one axis: cells by column, and the values of the changed keys."""
 
     cells: Mapping[str, Value]
     changes: Mapping[str, Value]
 
 
 def _seeds(given: Value) -> Value:
-    """Return a number of seeds as 0, 1, 2, ...; other forms are left to the validation."""
+    """Return the seeds 0, 1, 2 ... for a number of seeds; other values stay, for the validation."""
     listed = range(given) if type(given) is int else given
     return tuple(listed) if isinstance(listed, range | list) else given
 
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """The content of a sweep file. Paths are relative to its folder."""
+    """Content of a sweep file; paths are relative to the file's folder."""
 
     format: Literal["fgtrack-sweep/1"]
     estimators: tuple[str, ...]
-    """Run on the same stream each."""
+    """Estimators, which run on the same streams."""
     scenario: str | None = None
-    """A scenario file or `default`; it or `input` is needed."""
+    """Name or file of a scenario; either this or `input` is required."""
     input: str | None = None
     """A recording, instead of a scenario."""
     delays: str | None = None
-    """A file of delays by sensor that the recording is given (see `fgtrack convert --delays`)."""
+    """File with new delays by sensor for the recording (see `fgtrack convert --delays`)."""
     config: str | None = None
-    """A configuration file; null for the defaults."""
+    """Configuration file; null for the defaults."""
     duration_s: float | None = None
-    """Length of the simulated runs, instead of the scenario's."""
+    """Duration of the simulated runs, instead of the scenario's."""
     seeds: Annotated[tuple[NonNegativeInt, ...], BeforeValidator(_seeds)] = (0,)
-    """Seeds, or how many from 0 on."""
+    """List of seeds, or the number of seeds from 0."""
     set: Mapping[str, Value] = field(default_factory=dict)
-    """Keys that are changed for all runs alike."""
+    """Keys and values that are changed in all runs."""
     vary: Mapping[str, Value] = field(default_factory=dict)
-    """Axes of the grid: a key and its values, or a name and a group of keys with equally many values each."""
+    """Axes of the grid: a key with its values, or a name with a group of keys that have equally many values."""
     one_at_a_time: Mapping[str, Value] = field(default_factory=dict)
-    """Written as `vary`: the base, and then every value alone, all other keys as in the base."""
+    """As `vary`, but each value alone: the base, and then every value with all other keys as in the base."""
     metrics: tuple[str, ...] = ()
-    """Columns of metrics, `*` matches anything; all of them where none is named."""
+    """Columns of the metrics, where `*` matches any text; empty for all."""
 
     def __post_init__(self) -> None:
         object.__setattr__(
             self, "estimators", tuple(map(ESTIMATORS.resolve, self.estimators))
         )
-        is_recorded, changed = (
-            self.input is not None,
-            [self.set, *(point.changes for point in self.grid())],
-        )
+        is_recorded = self.input is not None
+        changed = [self.set, *(point.changes for point in self.grid())]
         redelays = self.delays is not None or any(
             key.startswith(f"{DELAYS}.") for keys in changed for key in keys
         )
         for name, values in (("estimators", self.estimators), ("seeds", self.seeds)):
             if not values or len(set(values)) < len(values):
-                raise ValueError(f"{name}: name at least one, and each once")
+                raise ValueError(f"{name}: give at least one, and each only once")
         for wrong, text in (
             (
                 is_recorded == (self.scenario is not None),
-                "scenario, input: name one of them",
+                "scenario, input: give exactly one of these keys",
             ),
             (
                 is_recorded and self.duration_s is not None,
-                "duration_s: a recording has its own length",
+                "duration_s: applies to a scenario only, remove the key",
             ),
             (
                 not is_recorded and self.delays is not None,
-                "delays: a scenario has its own, vary scenario.sensors",
+                "delays: applies to a recording only, vary scenario.sensors instead",
             ),
             (
                 is_recorded and len(self.seeds) > 1 and not redelays,
-                "seeds: a recording with its own delays has one",
+                "seeds: a recording with its recorded delays needs a single seed",
             ),
         ):
             if wrong:
                 raise ValueError(text)
 
     def grid(self) -> Iterator[Point]:
-        """Yield the points of the grid, the last axis changes fastest; raises `ValueError` with the key's path."""
+        """Yield the points of the grid; the last axis changes fastest. Raises `ValueError` with the path of the key."""
         axes = [
             _axis(f"vary.{name}", name, values) for name, values in self.vary.items()
         ]
@@ -150,7 +151,7 @@ class SweepConfig:
 
 
 def _axis(where: str, name: str, given: Value) -> list[Point]:
-    """Return the points of the axis at the path `where`."""
+    """Return the points of the axis `name`, whose key has the path `where`."""
     lists = given if isinstance(given, Mapping) else {name: given}
     lengths = {
         len(values) if isinstance(values, (list, tuple)) else 0
@@ -158,7 +159,7 @@ def _axis(where: str, name: str, given: Value) -> list[Point]:
     }
     if not set(lists) - {LABEL} or len(lengths) > 1 or 0 in lengths:
         raise ValueError(
-            f"{where}: a list of values is needed, or a mapping of keys to equally long lists"
+            f"{where}: must be a list of values, or a mapping of keys to equally long lists"
         )
     points = []
     for values in zip(*lists.values(), strict=True):
@@ -169,49 +170,50 @@ def _axis(where: str, name: str, given: Value) -> list[Point]:
 
 
 def _one_at_a_time(given: Mapping[str, Value]) -> list[Point]:
-    """Return the points of the base and of every value alone."""
+    """Return the point of the base, and a point for every value alone."""
     points = [Point({"changed": "base", "to": None}, {})]
     for name, values in given.items():
         for point in _axis(f"one_at_a_time.{name}", name, values):
             cells = list(point.cells.values())
-            alone = len(cells) == 1 or name in point.cells  # one key, or a label
+            has_one_cell = len(cells) == 1 or name in point.cells  # one key, or a label
             points.append(
                 Point(
-                    {"changed": name, "to": cells[0] if alone else cells}, point.changes
+                    {"changed": name, "to": cells[0] if has_one_cell else cells},
+                    point.changes,
                 )
             )
     return points
 
 
 def compact(value: Value) -> str:
-    """Return `value` as JSON without spaces."""
+    """JSON text of `value`, without spaces."""
     return json.dumps(value, separators=(",", ":"))
 
 
-#: All that decides the cells of one job, as plain values: `config`, `seed`, `estimators`, the `scenario` or the path
-#: `recording` with its `delays` by sensor; hashes of its `messages`, of `files` and of the `code`.
+#: Plain values that determine the cells of one job: `config`, `seed`, `estimators`, the `scenario` or the path
+#: `recording` with its `delays` by sensor; hashes of the `messages`, of `files` and of the `code`.
 Recipe = Mapping[str, Value]
 
 
 @dataclass(frozen=True)
 class Job:
-    """A grid point and a seed: one stream, and every estimator on it."""
+    """A point of the grid and a seed: one stream, on which every estimator runs."""
 
     cells: tuple[Value, ...]
-    """Content of the axes' columns."""
+    """Cells of the axes' columns."""
     seed: int
     key: str
-    """Hash of all that decides the result: settings, seed, estimators, versions, plug-ins, and what is read."""
+    """Hash of everything that determines the result: settings, seed, estimators, versions, plug-ins, read files."""
     recipe: Recipe | None
     problem: str | None = None
-    """Why the grid point cannot be run, where there is no recipe."""
+    """Reason why the point of the grid cannot be run, if there is no recipe."""
     is_data_bad: bool = False
-    """True if the problem is a file that cannot be read, and not a setting."""
+    """True if a file cannot be read; False if a setting is wrong."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The jobs of a sweep in the order of the grid: the last axis changes fastest, then the seed."""
+    """The jobs of a sweep in the order of the grid: the seed changes fastest, then the last axis."""
 
     columns: tuple[str, ...]
     """Columns of the axes."""
@@ -219,24 +221,28 @@ class Plan:
     estimators: tuple[str, ...]
     metrics: tuple[str, ...]
     inputs: tuple[Path, ...] = ()
-    """Files and folders that the sweep file names, and itself."""
+    """The sweep file, and the files and folders in it."""
 
 
 def load_plan(
     path: Path, recording: Path | None = None, settings: Sequence[str] = ()
 ) -> Plan:
-    """Return the plan of the sweep file `path`, with `settings` a.b=value for all its runs.
-    `recording` replaces the input of the file, with the first seed alone. Raises `CallError` for an invalid file, and
-    where no grid point can be run; a single point that cannot be run is a job with a problem.
+    """Return the plan of the sweep file `path`; `settings` contains settings `a.b=value` for all runs.
+
+    `recording` replaces the file's input, and is run with the first seed only. Raises
+    `CallError` for an invalid file, and if no point of the grid can be run because of
+    its settings. A single point that cannot be run becomes a job with a problem.
     """
-    sweep, folder = load(SweepConfig, path), path.parent
+    sweep = load(SweepConfig, path)
+    folder = path.parent
     changes: dict[str, Value] = {
         "set": {**sweep.set, **dict(map(key_and_value, settings))}
     }
     if recording is not None:
-        of_scenario = {"scenario": None, "duration_s": None, "delays": None}
         changes |= {
-            **of_scenario,
+            "scenario": None,
+            "duration_s": None,
+            "delays": None,
             "input": str(recording.resolve()),
             "seeds": sweep.seeds[:1],
         }
@@ -276,17 +282,17 @@ def load_plan(
 
 
 class _Recorded:
-    """The recording of a sweep, which each point reads by its own configuration of the input."""
+    """The recording of a sweep; each point of the grid reads it with its own input settings."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._known: dict[str, tuple[str, Mapping[str, object]] | FgtrackError] = {}
 
     def read(self, config: InputConfig) -> tuple[str, Mapping[str, object]]:
-        """Return the hash of the settings and messages that this configuration gives, and the settings.
+        """Return a hash of settings and messages, and the settings, of the recording read with `config`.
 
-        The hash is that of the content of all files that are read. Raises `CallError` where the configuration does not
-        fit the recording, and `DataError` where one of these files cannot be read.
+        The hash covers the content of all files that are read. Raises `CallError` if
+        `config` does not fit the recording, and `DataError` if a file cannot be read.
         """
         name = repr(config)
         if name not in self._known:
@@ -315,7 +321,7 @@ def _jobs(
     seeds: Sequence[int],
     recorded: _Recorded | None,
 ) -> list[Job]:
-    """Return the jobs of one grid point, one for each seed."""
+    """Return the jobs of one point of the grid, one for each seed."""
     cells = tuple(point.cells.values())
     try:
         values = _with_keys(base, point.changes, "vary")
@@ -347,7 +353,7 @@ def _jobs(
 
 
 def _content(name: str) -> bytes:
-    """Return the content of a file that a job reads. Raises `DataError`."""
+    """Return the content of a file that a job reads; raises `DataError`."""
     try:
         return Path(name).read_bytes()
     except OSError as error:
@@ -361,7 +367,7 @@ def _sha256(data: bytes) -> str:
 def _with_keys(
     base: Mapping[str, Value], changes: Mapping[str, Value], where: str
 ) -> dict[str, Value]:
-    """Return `base` with `changes`: dotted keys, those of the configuration without its name in front."""
+    """Return `base` with `changes`; keys of the configuration are written without the first name `config`."""
     changed = dict(base)
     for key, value in changes.items():
         names = names_of(key)
@@ -370,7 +376,9 @@ def _with_keys(
             or names[0] == "estimator"
             or names[0] in {SCENARIO, DELAYS} - base.keys()
         ):
-            raise CallError(f"{where}.{key}: is not a key of the runs of this sweep")
+            raise CallError(
+                f"{where}.{key}: cannot be changed in this sweep, remove the key"
+            )
         try:
             changed = with_value(
                 changed,

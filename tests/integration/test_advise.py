@@ -156,7 +156,7 @@ def test_without_a_configuration_the_sensors_are_those_of_the_recording(
     out = () if command == "offsets" else ("-o", "a.yaml")
     code, text = call(command, "drive.jsonl", *out)
     assert code == 0, text
-    assert "x_m 1, y_m 1 (usual of a detector" in text
+    assert "x_m 1, y_m 1 (usual for a LiDAR or RADAR detector" in text
     if out:
         assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
         assert set(load_run("run").config["sensors"]) == {"lidar", "radar"}
@@ -433,8 +433,8 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     )
     code, text = call("tune", "drive.jsonl", "-c", "c.yaml", "-o", "t.yaml")
     assert code == 0
-    assert "innovations still correlated in time (autocorrelation 0." in text
-    assert "white noise is too small for them" in text
+    assert "innovations remain correlated in time (autocorrelation 0." in text
+    assert "model time-correlated errors of this sensor" in text
 
 
 @pytest.mark.slow
@@ -477,4 +477,4 @@ def test_bad_calls(call: Call) -> None:
     code, text = call("advise", "cut.jsonl", "-c", "c.yaml")
     assert code == 1
     assert "No finding on: " in text
-    assert "used up to there" in text
+    assert "the messages before are used" in text

@@ -288,8 +288,8 @@ def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
     ("content", "message"),
     [
         (b"", "is empty"),
-        (b"hello\n", "is not an input"),
-        (b'{"type": "ego"}\n', "starts with a header"),
+        (b"hello\n", "has a format that fgtrack does not read"),
+        (b'{"type": "ego"}\n', "is no header record"),
         (
             b'{"type": "header", "format": "fgtrack-stream/2"}\n',
             "of format 'fgtrack-stream/1'",
@@ -332,7 +332,7 @@ def test_a_truncated_stream_is_replayed_up_to_the_break(
     stream.write_bytes(cut)
     called = fgtrack("replay", stream, "-o", "run")
     assert "drive.jsonl:" in called.error
-    assert "replayed up to there" in called.error
+    assert "the messages before are replayed" in called.error
     assert called.code == 1
     found = load_run("run")
     assert found.meta["complete"] is True
@@ -375,7 +375,7 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
     ignored = fgtrack(
         "replay", "sonar.jsonl", "-o", "run", "--set", "ignore_sensors=[sonar]"
     )
-    assert "holds neither ego states nor detections" in ignored.error
+    assert "contains neither ego states nor detections" in ignored.error
     assert ignored.code == 1
 
 

@@ -189,5 +189,5 @@ def test_the_command_shows_a_table_and_exits_1_where_the_input_breaks_off(
     shown = capsys.readouterr()
     assert "reference" in shown.out
     assert "reported stamp - true time" in shown.out
-    assert "used up to there" in shown.err
+    assert "the messages before are used" in shown.err
     assert len(shown.err.splitlines()) == 1

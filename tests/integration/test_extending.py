@@ -128,7 +128,7 @@ def test_the_commands_of_the_page_run_and_workers_load_the_package(
     ]
     # the same filter, which is only made again where the other one finds the direction of a new object itself
     assert abs(last_x_m(tracks[0]) - last_x_m(tracks[1])) < 0.02
-    assert re.search(r"all \d+ promises kept", said)
+    assert re.search(r"all \d+ promises are kept", said)
     assert (folder / "other/tracks.csv").stat().st_size > 2000
     assert (folder / "other/config.yaml").read_text().count("acceleration") >= 1
     assert (folder / "sweep/sweep.csv").read_text().count("refilter") == 2

@@ -26,7 +26,7 @@ def test_a_sweep_is_drawn_by_its_folder(
 ) -> None:
     sweep = str(a_sweep(tmp_path / "sweep"))
     assert command(["figure", sweep, "-o", str(tmp_path / "few")]) == 0
-    assert "1 more with --all" in capsys.readouterr().out
+    assert "1 more figures with --all" in capsys.readouterr().out
     assert [file.name for file in (tmp_path / "few").iterdir()] == [
         "sweep_truth.overall.errors.position_m.rmse.png"
     ]
@@ -40,7 +40,7 @@ def test_a_sweep_is_drawn_alone(
 ) -> None:
     sweep, out = str(a_sweep(tmp_path / "sweep")), ["-o", str(tmp_path / "out")]
     for more, message in (
-        ([str(tmp_path)], "name it alone"),
+        ([str(tmp_path)], "give it alone"),
         (["--stamp", "1"], "without --stamp"),
     ):
         assert command(["figure", sweep, *more, *out]) == 2

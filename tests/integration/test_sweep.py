@@ -248,7 +248,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_gives_the_same_bytes(
     capsys.readouterr()
     assert run(["sweep", str(smoke), "-o", str(out), "--jobs", "1"]) == 0
     assert (
-        f"jobs: {total}, each of 2 estimators; to do: {total - len(kept)}"
+        f"jobs: {total} with 2 estimators each; to do: {total - len(kept)}"
         in capsys.readouterr().out
     )
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -362,7 +362,7 @@ vary:
     assert len(said) == 1
     first = "what=negative gate, .*association.gate_m: "
     assert re.match(
-        rf"fgtrack: error: .*errors\.csv: 4 bad cells, the first: {first}", said[0]
+        rf"fgtrack: error: .*errors\.csv: 4 cells failed, the first: {first}", said[0]
     )
 
 
@@ -407,7 +407,7 @@ def test_a_changed_sweep_reuses_what_it_can(
     assert run(call) == 0
     write_sweep(tmp_path, text.replace("seeds: 2", "seeds: 3").replace("3.0", "2.0"))
     assert run(call) == 0
-    assert "jobs: 6, each of 1 estimators; to do: 4" in capsys.readouterr().out
+    assert "jobs: 6 with 1 estimators each; to do: 4" in capsys.readouterr().out
     assert [row["association.gate_m"] for row in rows(out / "sweep.csv")] == [
         "5.0"
     ] * 3 + ["2.0"] * 3

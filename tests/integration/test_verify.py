@@ -28,7 +28,7 @@ class Careless(ReplayEkf):
 def test_the_command_prints_a_table_and_a_closing_line(capsys: Capture) -> None:
     assert run(["verify", "-e", "ekf-replay"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"all \d+ promises kept", lines[-1])
+    assert re.fullmatch(r"all \d+ promises are kept", lines[-1])
     assert any("ekf-replay" in line and "any lag, any number" in line for line in lines)
 
 
@@ -52,7 +52,7 @@ def test_a_broken_promise_is_shown_with_its_measurements_and_fails_the_command(
         in out
     )
     assert "measurements in the order of arrival" in out
-    assert re.fullmatch(r"fgtrack: error: [1-9]\d* of \d+ promises broken\n", err)
+    assert re.fullmatch(r"fgtrack: error: [1-9]\d* of \d+ promises are broken\n", err)
     assert run(["verify", "-e", "ekf-replay", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["met"] is False
 

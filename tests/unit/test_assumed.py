@@ -172,7 +172,7 @@ def test_what_a_recording_carries_is_taken_where_the_configuration_is_open() -> 
     }
     assert found.lines() == [
         "assumed, recording: ego.detection_origin_x_m -1.74, map.track oval (recorded)",
-        "assumed, lidar: standard deviations x_m 1, y_m 1 (usual of a detector of cars by LiDAR or RADAR); "
+        "assumed, lidar: standard deviations x_m 1, y_m 1 (usual for a LiDAR or RADAR detector of cars); "
         "mounted at 2 m, 0 m, sees 115 degrees, up to 80 m (recorded)",
     ]
 
@@ -350,7 +350,7 @@ def test_where_sensors_disagree_about_a_hull_a_track_claims_what_is_near() -> No
     assert found.config.lifecycle.min_travel_m == pytest.approx(
         3.0 * apart_m / math.sqrt(2.0), abs=1.0
     )
-    assert "nothing begins within" in found.lines()[-1]
+    assert "no track begins within" in found.lines()[-1]
     for sensor in (
         found.config.sensors.values()
     ):  # half of the variance each, nearly all of it an offset that lasts
@@ -414,14 +414,14 @@ def test_windows_hold_two_lists_of_the_slowest_sensor_up_to_a_minute(
         lag_s,
         lag_s + 2.0,
     )
-    assert ("longer than windows may be" in found.lines()[-1]) == (lag_s == 58.0)
+    assert ("longer than the longest window" in found.lines()[-1]) == (lag_s == 58.0)
 
 
 def test_boxes_are_taken_to_be_more_exact_than_points() -> None:
     box = replace(POINT, length_m=4.0, width_m=1.8)
     found = assumed(Config(), source_of(lambda: [message(box, sensor="lidar")]))
     assert found.config.sensors["lidar"].std == {"x_m": 0.3, "y_m": 0.3}
-    assert "usual of boxes" in found.lines()[0]
+    assert "usual for boxes" in found.lines()[0]
 
 
 def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
@@ -438,7 +438,7 @@ def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
         math.pi, abs=0.01
     )
     assert (
-        "axis 180 degrees, sees 57 degrees, up to 33 m (where it detects, of 360 detections"
+        "axis 180 degrees, field of view 57 degrees, range 33 m (coverage of 360 detections"
         in found.lines()[0]
     )
 

@@ -143,11 +143,11 @@ one_at_a_time:
             "seeds: 100001",
             "vary: 100001 combinations of values and seeds, at most 100000",
         ),
-        ("seeds: [1, 1]", "seeds: name at least one, and each once"),
+        ("seeds: [1, 1]", "seeds: give at least one, and each only once"),
         ("seeds: [-1]", "seeds.0: Input should be greater than or equal to 0"),
         (
             "vary: {association.gate_m: 5.0}",
-            "vary.association.gate_m: a list of values is needed",
+            "vary.association.gate_m: must be a list of values",
         ),
         (
             "vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}",
@@ -155,14 +155,14 @@ one_at_a_time:
         ),
         (
             "set: {estimator: smoother}",
-            "set.estimator: is not a key of the runs of this sweep",
+            "set.estimator: cannot be changed in this sweep",
         ),
         (
             "vary: {delays.radar.delay: [null]}",
-            "vary.delays.radar.delay: is not a key of the runs of this sweep",
+            "vary.delays.radar.delay: cannot be changed in this sweep",
         ),
-        ("delays: d.yaml", "delays: a scenario has its own"),
-        ("input: x", "scenario, input: name one of them"),
+        ("delays: d.yaml", "delays: applies to a recording only"),
+        ("input: x", "scenario, input: give exactly one of these keys"),
         (
             "vary: {clok.node_hz: [5.0, 7.0]}",
             "clok.node_hz=5.0: config: clok: unknown key",
@@ -189,7 +189,7 @@ def test_an_error_names_the_path_of_the_key(plan: Any, text: str, said: str) -> 
         ("scenario: default\nestimators: [ekf-replay]", "format: Field required"),
         (
             "format: fgtrack-sweep/1\nscenario: default\nestimators: []",
-            "estimators: name at least one",
+            "estimators: give at least one",
         ),
         (
             "format: fgtrack-sweep/1\ninput: nothing.mcap\nestimators: [ekf-replay]",
@@ -231,7 +231,8 @@ def test_a_recording_with_its_own_delays_has_one_seed(
     (job,) = plan("", recording).jobs
     assert (job.recipe["delays"], "scenario" in job.recipe) == ({}, False)
     with pytest.raises(
-        CallError, match="seeds: a recording with its own delays has one"
+        CallError,
+        match="seeds: a recording with its recorded delays needs a single seed",
     ):
         plan("seeds: 2", recording)
 
@@ -612,7 +613,7 @@ def test_the_job_of_a_damaged_part_is_repeated(
     )
     part(tmp_path, "k0", text)
     assert [job.key for job in Sweep.open(TABLES, tmp_path).todo] == ["k0"]
-    assert "k0.json: is damaged, its job is repeated" in caplog.text
+    assert "k0.json: is damaged, so its job is repeated" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["sweep.csv", "paired.csv"])

@@ -1,1 +1,1 @@
-"""Assumptions about a recording that comes without a configuration: what its own lists show."""
+"""Assumptions about a recording without a configuration, estimated from its own lists."""

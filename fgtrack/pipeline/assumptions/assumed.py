@@ -1,4 +1,4 @@
-"""Assumptions of a replay where the configuration leaves a setting open: what a recording carries and shows."""
+"""Assumes settings that the configuration leaves open, from the contents and the detections of a recording."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -22,7 +22,7 @@ from fgtrack.tracking.lives.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "assumed", "is_open", "source_of"]
 
-#: Standard deviations of a sensor that nothing specifies: a detector of cars by LiDAR or RADAR.
+#: Standard deviations of a sensor without settings: a LiDAR or RADAR detector of cars.
 ASSUMED_STD = {
     "x_m": 1.0,
     "y_m": 1.0,
@@ -33,38 +33,47 @@ ASSUMED_STD = {
     "range_rate_mps": 0.5,
 }
 _BOX_STD_M = 0.3
-"""Standard deviation of the middle of a box: the translation error of LiDAR detectors is 0.25 to 0.5 m (nuScenes)."""
-_LISTS_OUT_OF_VIEW, _SILENCES = 2.5, 1.5
-"""Periods of the slowest sensor, and longest silences of one, for which a track that is out of view lives on."""
+"""Standard deviation of the centre of a box: the translation error of LiDAR detectors is 0.25 to 0.5 m (nuScenes)."""
+#: A track out of view continues for this number of periods of the slowest sensor, or of longest silences.
+_LISTS_OUT_OF_VIEW = 2.5
+_SILENCES = 1.5
 _LEAST_CLUTTER = 0.05
-"""False detections of a list that can never be excluded."""
-_LEAST_SHARE, _LARGEST_SHARE, _OFFSET_S = 0.5, 0.99, 30.0
-"""Bounds of the share of time-correlated errors: fewer are not modelled. Their correlation time: the offset of what a
-sensor sees of a hull changes with its aspect, within tens of seconds."""
+"""Smallest assumed number of false detections in a list; fewer cannot be excluded."""
+#: Share of time-correlated errors in the variance: smaller shares are not modelled, larger ones are limited.
+_LEAST_SHARE = 0.5
+_LARGEST_SHARE = 0.99
+#: Correlation time: the detected point of a hull changes with its aspect, within tens of seconds.
+_OFFSET_S = 30.0
 _HULLS = 2.0 * math.sqrt(12.0)
-"""Length of a long hull over the standard deviation, per axis, of the difference of two of its detections."""
+"""Length of a long hull, divided by the standard deviation on each axis of the difference of two of its detections."""
 _LONGEST_S = 60.0
-"""Of any window."""
-#: Standard deviation per step at 100 Hz, hence a density of 225 m^2/s^3. Singer's model (Estimating optimal tracking
-#: filter performance for manned maneuvering targets, IEEE T-AES 1970) has 2 sigma^2 tau: an aircraft that banks by at
-#: most 25 degrees accelerates by 4.6 m/s^2, evenly distributed sigma = 2.6 m/s^2, for some 17 s. Ships do less.
+"""Longest window."""
+#: Standard deviation per step at 100 Hz, which is a density of 225 m^2/s^3. The density of Singer's model (Estimating
+#: optimal tracking filter performance for manned maneuvering targets, IEEE T-AES 1970) is 2 sigma^2 tau. An aircraft
+#: that banks by at most 25 degrees accelerates by up to 4.6 m/s^2 for some 17 s; for uniform accelerations sigma is
+#: 2.6 m/s^2. Ships manoeuvre less.
 _MANOEUVRES = {"velocity": 150.0}
-RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
-USUAL_BOX = "usual of boxes that a detector fits to cars"
+#: Reasons of assumptions.
+RECORDED = "recorded"
+USUAL = "usual for a LiDAR or RADAR detector of cars"
+USUAL_BOX = "usual for boxes that a detector fits to cars"
 _UNPLACED = (
-    "gives no position, and bearings from an unknown mount err by more than the tracks"
+    "no positions, and bearings from an unknown mount are less accurate than the tracks"
 )
 _TWO_LISTS = "two lists of the slowest sensor"
-"""Reasons."""
 
 Coverages = Mapping[str, Coverage]
 Rule = Callable[[Config, Coverages], Iterator[Assumption]]
+"""Yields assumptions from the configuration and the sensors' coverages."""
 
 
 def assumed(config: Config, source: InputSource) -> Assumed:
-    """`config` with nothing left open, and what of it was assumed; a key that is set stays as it is.
-    The first that gives a key decides: what `source` carries (origin of detections, track, mounts and views of
-    sensors); what its detections show (`coverages`); usual values: standard deviations, a sensor that looks all around.
+    """Return `config` with assumptions for all settings that it leaves open; given settings stay.
+
+    The first source that specifies a setting counts: settings that `source` carries
+    (origin of detections, track, mounts and fields of view); estimates from the
+    detections (`coverages`); usual values (standard deviations, a field of view all
+    around).
     """
     carried = recorded(source)
     result = Assumed(config).assuming(*_recorded(config, carried))
@@ -83,13 +92,10 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         ]
         rules += [_claim, _offsets, _unplaced, _windows]
         if config.sensors:
-            rules, covered = (
-                [],
-                {
-                    name: replace(item, persistence=None)
-                    for name, item in covered.items()
-                },
-            )
+            rules = []
+            covered = {
+                name: replace(item, persistence=None) for name, item in covered.items()
+            }
         for rule in (*rules, _views, _out_of_view):
             result = result.assuming(*rule(result.config, covered))
     config = result.config
@@ -104,24 +110,24 @@ def assumed(config: Config, source: InputSource) -> Assumed:
 
 
 def is_open(config: Config) -> bool:
-    """True if `config` has no sensors, or nothing of where one of them sees: then `assumed` reads the messages."""
+    """True if `config` has no sensors, or a sensor without a field of view: then `assumed` reads the messages."""
     return not config.sensors or not all(
         sensor.has_view_limits for sensor in config.used_sensors.values()
     )
 
 
 def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
-    """Messages in memory as an input."""
+    """Input source of messages in memory."""
     return InputSource(Path(), "messages", lambda: iter(messages()))
 
 
 def _covered(
     source: InputSource, config: Config, mounts: Mapping[str, Mount]
 ) -> Coverages:
-    """Coverage of the sensors that are not ignored, of those that only `input` names as well."""
+    """Coverage of all sensors in the recording or in `config.input`, without ignored sensors."""
 
     def readable() -> Iterator[Message]:
-        with suppress(DataError):  # the replay ends there, too, and reports it
+        with suppress(DataError):  # the replay ends there too, and reports the error
             for message in source.messages():
                 if not (
                     isinstance(message, DetectionList)
@@ -135,15 +141,16 @@ def _covered(
 
 
 def _sensor(name: str, reason: str, **settings: object) -> Iterator[Assumption]:
-    """Yield the settings of a sensor that are not None."""
+    """Yield assumptions for the settings of a sensor that are not None."""
     for key, value in settings.items():
         if value is not None:
             yield Assumption(("sensors", name, key), value, reason)
 
 
 def _recorded(config: Config, carried: Recorded) -> Iterator[Assumption]:
-    """Yield what the recording carries where `config` is open."""
-    sections: list[tuple[tuple[str, ...], Any, Any]]  # Any: dataclasses
+    """Yield the settings that the recording carries, where `config` leaves them open."""
+    # Path of a section, the section of `config`, and the recorded section. Any: dataclasses.
+    sections: list[tuple[tuple[str, ...], Any, Any]]
     sections = [
         (("ego",), config.ego, carried.ego),
         (("map",), config.map, carried.map),
@@ -159,9 +166,11 @@ def _recorded(config: Config, carried: Recorded) -> Iterator[Assumption]:
 
 
 def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield motion and clock of objects that every sensor measures too seldom for the defaults.
-    The standard deviation of a heading after t without a measurement is sqrt(q t^3 / 3), q the density of the yaw rate;
-    above 1 rad a straight line with the noise of `_MANOEUVRES` predicts better. Windows hold two measurements then.
+    """Yield motion model, clock and windows for objects that every sensor measures too rarely for the defaults.
+
+    The standard deviation of a heading after the time t without a measurement is sqrt(q
+    t^3 / 3), with the density q of the yaw rate. Above 1 rad, a straight line with the
+    noise `_MANOEUVRES` predicts better. The windows then hold two measurements.
     """
     intervals_s = [item.revisit_s for item in covered.values() if item.num_lists]
     limit_s = math.cbrt(3.0 / (MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ))
@@ -169,7 +178,10 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
     if shortest_s <= limit_s:
         return
     window_s = min(float(math.ceil(2.0 * shortest_s)), _LONGEST_S)
-    reason = f"an object is measured every {shortest_s:.2g} s, the default model loses its heading in {limit_s:.2g} s"
+    reason = (
+        f"an object is measured every {shortest_s:.2g} s, but the default model predicts its heading "
+        f"for {limit_s:.2g} s only"
+    )
     settings = {
         ("motion", "kind"): "cv",
         ("motion", "std_per_s"): _MANOEUVRES,
@@ -183,11 +195,13 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield the usual standard deviations of the sensors."""
+    """Yield usual standard deviations of the sensors."""
     cartesian = {"x_m", "y_m"}
     for name, item in covered.items():
-        twice = {"range_m", "bearing_rad"} if cartesian <= item.measured else cartesian
-        components = item.measured - twice or cartesian
+        redundant = (
+            {"range_m", "bearing_rad"} if cartesian <= item.measured else cartesian
+        )
+        components = item.measured - redundant or cartesian
         usual = ASSUMED_STD | (
             dict.fromkeys(cartesian, _BOX_STD_M) if item.boxes else {}
         )
@@ -200,24 +214,29 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield what the lists of the sensors show of scans, misses, clutter and scores."""
+    """Yield kind of the lists, detection probability, clutter and score model of the sensors."""
     for name, one in covered.items():
-        shown = one.persistence
+        persistence = one.persistence
         if not one.scans:
             yield from _sensor(
-                name, "its lists hold one object, and none is empty", scan=False
+                name, "its lists contain one object, and none is empty", scan=False
             )
-        if one.scans and shown is not None and one.area_m2:
-            reason = f"how its detections persist, of {len(shown.lines)} in three lists running"
-            clutter_per_m2 = max(shown.clutter_per_list, _LEAST_CLUTTER) / one.area_m2
+        if one.scans and persistence is not None and one.area_m2:
+            reason = (
+                f"persistence of {len(persistence.lines)} detections "
+                "that recur in three successive lists"
+            )
+            clutter_per_m2 = (
+                max(persistence.clutter_per_list, _LEAST_CLUTTER) / one.area_m2
+            )
             clutter_per_m2 = float(
-                f"{max(clutter_per_m2, shown.near_clutter_per_m2):.2g}"
+                f"{max(clutter_per_m2, persistence.near_clutter_per_m2):.2g}"
             )
-            score = shown.score and {
-                "even": float(f"{shown.score.even:.3g}"),
-                "scale": float(f"{shown.score.scale:.3g}"),
+            score = persistence.score and {
+                "even": float(f"{persistence.score.even:.3g}"),
+                "scale": float(f"{persistence.score.scale:.3g}"),
             }
-            probability = round(shown.detection_probability, 2)
+            probability = round(persistence.detection_probability, 2)
             yield from _sensor(
                 name,
                 reason,
@@ -227,49 +246,59 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
             )
         elif one.density_per_m2 < config.sensors[name].clutter_per_m2:
             density = max(float(f"{one.density_per_m2:.2g}"), SMALLEST)
-            reason = "all detections of a list over the area that they cover"
+            reason = "mean number of detections in a list, over their area"
             yield from _sensor(name, reason, clutter_per_m2=density)
 
 
 def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield that a track claims what is as near to it as a hull is long, where sensors disagree by more than they err.
-    Two detections spread evenly over a hull of length l, in any direction, differ by l / sqrt(12) on each axis. Typical
-    objects show it; the hulls that are seen at both ends are twice as long.
-    Positions without boxes are of anything: what has not moved by three standard deviations is shore, or moored.
+    """Yield rules for large hulls, if sensors disagree by more than usual errors.
+
+    A track suppresses births within the length of a hull. Two detections, uniform over
+    a hull of length l in any direction, differ by l / sqrt(12) on each axis. Sensors
+    show the disagreement of typical hulls; a hull that is detected at both ends is
+    twice as long. Positions without boxes may belong to anything, so a track is
+    confirmed only after it has moved by three standard deviations: otherwise it may be
+    a shore or a moored ship.
     """
-    apart_m = max(
+    largest_m = max(
         (item.disagreement_m or 0.0 for item in covered.values()), default=0.0
     )
-    if apart_m <= ASSUMED_STD["x_m"]:
+    if largest_m <= ASSUMED_STD["x_m"]:
         return
-    reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
+    reason = f"sensors disagree by {largest_m:.2g} m on each axis, as on large hulls"
     if config.association == GatedMahalanobis():
         yield Assumption(
-            ("association", "claim_m"), float(round(_HULLS * apart_m)), reason
+            ("association", "claim_m"), float(round(_HULLS * largest_m)), reason
         )
     if config.lifecycle == ExistenceRules() and not any(
         item.boxes for item in covered.values()
     ):
-        travel_m = float(round(3.0 * apart_m / math.sqrt(2.0)))
+        travel_m = float(round(3.0 * largest_m / math.sqrt(2.0)))
         yield Assumption(("lifecycle", "min_travel_m"), travel_m, reason)
 
 
 def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield time-correlated errors of sensors that disagree by more than errors that differ from list to list.
-    Of two sensors each has half of the variance, beside its own errors e: s^2 = e^2 + max(d^2 / 2 - e^2, 0).
+    """Yield time-correlated errors of sensors that disagree by more than their independent errors explain.
+
+    Each of two sensors has half of the variance of their difference d, beside its
+    independent errors e: s^2 = e^2 + max(d^2 / 2 - e^2, 0).
     """
     for name, one in covered.items():
         std = config.sensors[name].std
         if one.disagreement_m is None or one.persistence is None or "x_m" not in std:
             continue
-        own_m = max(std["x_m"], one.persistence.std_m)
+        independent_m = max(std["x_m"], one.persistence.std_m)
         std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")
-        if (1.0 - _LEAST_SHARE) * std_m**2 >= own_m**2:
+        if (1.0 - _LEAST_SHARE) * std_m**2 >= independent_m**2:
+            share = 1.0 - (independent_m / std_m) ** 2
             correlation = {
-                "share": min(round(1.0 - (own_m / std_m) ** 2, 2), _LARGEST_SHARE),
+                "share": min(round(share, 2), _LARGEST_SHARE),
                 "time_s": _OFFSET_S,
             }
-            reason = f"it and another sensor disagree by {one.disagreement_m:.2g} m on each axis, as on large hulls"
+            reason = (
+                f"this sensor and another one disagree by {one.disagreement_m:.2g} m on each axis, "
+                "as on large hulls"
+            )
             yield from _sensor(
                 name,
                 reason,
@@ -279,7 +308,7 @@ def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield that sensors of bearings alone are left out beside positions, unless their mount is known."""
+    """Yield that sensors with bearings alone and an unknown mount are ignored, if other sensors measure positions."""
     unplaced = [
         name
         for name, item in config.sensors.items()
@@ -292,7 +321,7 @@ def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield windows that hold two lists of the slowest sensor that takes part."""
+    """Yield windows that hold two lists of the slowest sensor in use."""
     rates_hz = [
         item.rate_hz
         for name, item in covered.items()
@@ -308,7 +337,7 @@ def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
         reason = (
             _TWO_LISTS
             if lag_s == needed_s
-            else f"{_TWO_LISTS} take {needed_s:g} s, longer than windows may be"
+            else f"{_TWO_LISTS} take {needed_s:g} s, longer than the longest window"
         )
         yield Assumption(("smoother", "lag_s"), lag_s, reason)
         yield Assumption(
@@ -317,7 +346,7 @@ def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield the sector and the ranges in which sensors detect of whose view nothing is given."""
+    """Yield sector and range of sensors without a given field of view."""
     for name, sensor in config.sensors.items():
         if sensor.scan and not sensor.has_view_limits and name in covered:
             one = covered[name]
@@ -329,7 +358,7 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
             )
             yield from _sensor(
                 name,
-                f"where it detects, of {one.num_detections} detections in {one.num_lists} lists{rate}",
+                f"coverage of {one.num_detections} detections in {one.num_lists} lists{rate}",
                 mount=plain(Mount(yaw_rad=one.axis_rad)) if one.axis_rad else None,
                 field_of_view_rad=one.field_of_view_rad,
                 view_range_m=one.range_m,
@@ -338,32 +367,33 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield the life of a track out of view: with one sensor of positions until its first list without the track,
-    else two lists of the slowest sensor, and the longest silence of the one that saw it.
+    """Yield `lifecycle.out_of_view_s`, the time that a track out of view continues.
+
+    With one position sensor it is half the sensor's period, so the track ends at the
+    first list without it. Otherwise it is the largest of the default, 2.5 periods of
+    the slowest sensor, and 1.5 times the longest silence of a position sensor.
     """
     periods_s = {
         name: 1.0 / item.rate_hz for name, item in covered.items() if item.rate_hz
     }
-    placing = [
+    position_sensors = [
         name for name, item in config.used_sensors.items() if item.gives_position
     ]
     default_s = ExistenceRules.out_of_view_s
-    if len(placing) == 1 and placing[0] in periods_s:
-        longest_s, reason = (
-            0.5 * periods_s[placing[0]],
-            "no other sensor gives positions, half its period",
-        )
+    if len(position_sensors) == 1 and position_sensors[0] in periods_s:
+        longest_s = 0.5 * periods_s[position_sensors[0]]
+        reason = "half the period of the only sensor with positions"
     else:
         slow_s = _LISTS_OUT_OF_VIEW * max(periods_s.values(), default=0.0)
         silent_s = _SILENCES * max(
-            (covered[name].silence_s for name in placing if name in covered),
+            (covered[name].silence_s for name in position_sensors if name in covered),
             default=0.0,
         )
         longest_s = max(default_s, slow_s, silent_s)
         reason = (
             _TWO_LISTS
             if longest_s == slow_s
-            else "beyond the longest silence of a sensor"
+            else "longer than the longest silence of a sensor"
         )
     if (
         isinstance(config.lifecycle, ExistenceRules)

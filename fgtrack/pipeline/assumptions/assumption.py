@@ -1,4 +1,4 @@
-"""Assumptions: settings that the user has not given, with their reasons, in words and as YAML."""
+"""Assumptions: settings that the user has not given, with their reasons, as sentences and as YAML."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,66 +25,66 @@ def _mounted(value: Mapping[str, float]) -> str:
     return f"mounted at {value['x_m']:g} m, {value['y_m']:g} m{axis}"
 
 
-#: Settings in words, by the last name of their keys.
-_WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
+#: Functions that describe the value of a setting, by the last name of its key.
+_WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: the key's type
     "std": lambda std: (
         f"standard deviations {', '.join(f'{name} {one:g}' for name, one in std.items())}"
     ),
-    "correlation": "{0[share]:.0%} of the variance lasts for some {0[time_s]:g} s".format,
+    "correlation": "{0[share]:.0%} of the variance is correlated over {0[time_s]:g} s".format,
     "detection_probability": "detection probability {:g}".format,
     "clutter_per_m2": "clutter {:g} per m2".format,
-    "score": "score {0[even]:g} as often of objects as of clutter, e times per {0[scale]:g}".format,
+    "score": "at score {0[even]:g} as many objects as clutter, e times more for each {0[scale]:g}".format,
     "scan": lambda _: "reports objects one by one",
     "out_of_view_s": "tracks out of view end after {:g} s".format,
     "lag_s": "smoothers keep {:g} s".format,
     "storage_s": "filters keep {:g} s".format,
-    "claim_m": "nothing begins within {:g} m of a track".format,
-    "min_travel_m": "nothing is confirmed that has not moved by {:g} m".format,
-    "ignore_sensors": lambda names: f"{', '.join(names)} left out",
+    "claim_m": "no track begins within {:g} m of another track".format,
+    "min_travel_m": "tracks are confirmed after a movement of {:g} m".format,
+    "ignore_sensors": lambda names: f"{', '.join(names)} ignored",
     "field_of_view_rad": lambda rad: (
-        "sees all around"
+        "field of view all around"
         if rad >= math.tau
-        else f"sees {math.degrees(rad):.0f} degrees"
+        else f"field of view {math.degrees(rad):.0f} degrees"
     ),
-    "view_range_m": "up to {:g} m".format,
-    "max_range_m": "used up to {:g} m, beyond which clutter outweighs objects".format,
-    "max_range_behind_m": "behind it up to {:g} m".format,
+    "view_range_m": "range {:g} m".format,
+    "max_range_m": "used up to {:g} m, beyond which clutter outnumbers objects".format,
+    "max_range_behind_m": "range {:g} m to the rear".format,
     "mount": _mounted,
 }
 
 
 @dataclass(frozen=True)
 class Assumption:
-    """A setting that the user has not given."""
+    """An assumed value of a setting that the user has not given."""
 
     path: tuple[str, ...]
-    """Names of the path of its key in the configuration."""
+    """Names in the path of the configuration key."""
     value: object
-    """A plain value, as YAML has it."""
+    """Plain value, as in YAML."""
     reason: str
-    """A short sentence."""
+    """Reason in a short sentence."""
 
     @property
     def key(self) -> str:
-        """Key of the configuration, with dots between the names of its path: `sensors.radar.std`."""
+        """Configuration key, with dots between its names: `sensors.radar.std`."""
         return ".".join(self.path)
 
     @property
     def text(self) -> str:
-        """The setting in words, without its sensor and its reason."""
+        """Setting in words, without its sensor and its reason."""
         words = _WORDS.get(self.path[-1])
         return f"{self.key} {self.value}" if words is None else words(self.value)
 
 
 @dataclass(frozen=True)
 class Assumed:
-    """A configuration, and what of it was assumed."""
+    """A configuration, and the assumptions that it contains."""
 
     config: Config
     assumptions: tuple[Assumption, ...] = ()
 
     def assuming(self, *new: Assumption) -> "Assumed":
-        """Return it with further assumptions, which replace those of the same keys."""
+        """Return the configuration with further assumptions, which replace earlier assumptions of the same keys."""
         raw = plain(self.config)
         for item in new:
             raw = with_value(raw, item.path, item.value)
@@ -97,7 +97,11 @@ class Assumed:
         head: Iterable[str] = (),
         comments: Iterable[tuple[Sequence[str], str]] = (),
     ) -> str:
-        """YAML, with comments and `head`, of all settings that differ from defaults, assumed ones with a reason."""
+        """YAML text of all settings that differ from the defaults; assumptions have their reason as a comment.
+
+        `head` contains comment lines for the beginning, `comments` further comments by
+        the path of their key.
+        """
         tree = _commented(departures(self.config))
         for path, reason in [
             *((one.path, f"assumed: {one.reason}") for one in self.assumptions),
@@ -116,7 +120,7 @@ class Assumed:
         )
 
     def lines(self) -> list[str]:
-        """Return the assumptions in words: a line for each sensor, and one for the rest."""
+        """Return the assumptions in words: a line for each sensor, and a line for the other settings."""
         result: dict[str, dict[str, list[str]]] = {}
         for item in self.assumptions:
             about = item.path[1] if item.path[0] == "sensors" else "recording"
@@ -131,7 +135,7 @@ class Assumed:
 
 
 def departures(value: object) -> Any:  # Any: plain values
-    """Return plain values; of dataclasses those that are not the defaults, and their forms (`kind`)."""
+    """Plain values of `value`; fields of dataclasses are left out if they have the default, except `kind`."""
     if isinstance(value, Mapping):
         return {name: departures(item) for name, item in value.items()}
     if not is_dataclass(value):

@@ -1,4 +1,4 @@
-"""Coverage of a sensor: its field of view, range and rate, and the kind of its lists, estimated from a recording."""
+"""Estimates the coverage of a sensor from a recording: field of view, range, rate and kind of its lists."""
 
 import math
 from array import array
@@ -31,73 +31,98 @@ from fgtrack.pipeline.assumptions.persistence import (
 
 __all__ = ["Coverage", "coverages"]
 
-#: Share of detections that may lie outside of the estimated view, and the number of which it is one at least.
-_OUTSIDE, _FEWEST = 0.01, 100
-#: Cells in which a detection must come back: at least so long, so many periods of the sensor, and so wide.
-_CELL_S, _CELL_PERIODS, _CELL_M, _CELL_MPS, _CELL_BEARING = 0.25, 5.0, 3.0, 30.0, 0.3
-#: How near detections follow one another up to the edges of a sector, and the margin of a range.
-_LINK_RAD, _RANGE_FACTOR = 0.2, 1.1
-#: No sensor of vehicles has a narrower sector (20 degrees, long-range RADAR); wider ones look like traffic.
-_NARROWEST_RAD, _WIDEST_RAD = 0.35, 2.8
-#: Axes are multiples of 45 degrees, where the middle of the sector is so near to one.
-_AXES_RAD, _AXIS_TOLERANCE_RAD = math.pi / 4.0, 0.15
-#: Lists with one object, as a share of all, that show a sensor to report objects one by one; and the fewest lists.
-_REPORTS_SHARE, _FEWEST_LISTS = 0.75, 10
-#: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
-_FASTEST_MPS, _POSITION_M = 300.0, 10.0
-#: Memory of earlier detections, and the most and fewest revisits that count.
-_MEMORY_S, _MOST_REVISITS, _FEWEST_REVISITS = 60.0, 5000, 20
+#: Share of detections that may lie outside of the estimated view.
+_OUTSIDE = 0.01
+#: Fewest detections for an estimate.
+_FEWEST = 100
+#: Cells of space and time in which a detection must recur: least duration, and duration in periods of the sensor.
+_CELL_S = 0.25
+_CELL_PERIODS = 5.0
+#: Width of the cells for positions, [m] and [m/s] times the duration, and for bearings (on the unit circle).
+_CELL_M = 3.0
+_CELL_MPS = 30.0
+_CELL_BEARING = 0.3
+#: Largest gap between successive bearings up to the edge of a sector.
+_LINK_RAD = 0.2
+#: Margin of the range.
+_RANGE_FACTOR = 1.1
+#: Narrowest sector of vehicle sensors: 20 degrees, long-range RADAR.
+_NARROWEST_RAD = 0.35
+#: Widest sector that is estimated; wider gaps in the bearings may come from the traffic.
+_WIDEST_RAD = 2.8
+#: Axes of sectors are multiples of this angle, if the middle of the sector is within the tolerance.
+_AXES_RAD = math.pi / 4.0
+_AXIS_TOLERANCE_RAD = 0.15
+#: Share of lists with one object from which a sensor reports objects one by one.
+_REPORTS_SHARE = 0.75
+#: Fewest lists for the judgement whether a sensor scans.
+_FEWEST_LISTS = 10
+#: Highest speed of an object: an airliner.
+_FASTEST_MPS = 300.0
+#: Largest error of a position.
+_POSITION_M = 10.0
+#: Memory of earlier detections for revisits.
+_MEMORY_S = 60.0
+#: Most revisits that are used, and fewest for an estimate.
+_MOST_REVISITS = 5000
+_FEWEST_REVISITS = 20
+#: Silence of a sensor after which objects count as new.
 _OUTAGE_S = 2.0
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Lists of a sensor and where it detects; by default those of a sensor without messages."""
+    """Coverage and lists of a sensor; the defaults describe a sensor without messages."""
 
     measured: frozenset[str] = frozenset()
-    """Components that its detections hold."""
+    """Components that the detections contain."""
     num_lists: int = 0
     num_detections: int = 0
     boxes: bool = False
-    """True if its detections have a length and a width."""
+    """True if the detections have a length and a width."""
     rate_hz: float | None = None
-    """Lists per second; None of fewer than two."""
+    """Lists per second; None for fewer than two lists."""
     silence_s: float = 0.0
-    """Longest time between two successive lists, up to `_OUTAGE_S`: after longer ones objects are new."""
+    """Longest time between two successive lists, up to `_OUTAGE_S`; after longer times objects count as new."""
     scans: bool = True
-    """False if it reports objects one by one, as ADS-B, AIS and V2X do: its lists hold one object, now and then several
-    by coincidence, and none is empty."""
+    """False if the sensor reports objects one by one, as ADS-B, AIS and V2X do.
+
+    Then most lists contain one object, a few contain several by coincidence, and none
+    is empty.
+    """
     density_per_m2: float = math.inf
-    """All detections of a list over the rectangle that holds those of all; infinite if unknown."""
+    """Mean number of detections in a list per area of the rectangle around all detections; infinite if unknown."""
     revisit_s: float | None = None
-    """Median time between two detections of an object; None without positions, or of too few."""
+    """Median time between two detections of an object; None without positions, or with too few detections."""
     persistence: Persistence | None = None
-    """Persistence of its detections from list to list; None where too few do."""
+    """Persistence of the detections from list to list; None if too few recur."""
     disagreement_m: float | None = None
-    """Least standard deviation of its positions against those of another sensor; None where none sees the same."""
+    """Smallest standard deviation between positions of this sensor and of another one; None without common objects."""
     area_m2: float | None = None
-    """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
+    """Area in which the detections with a range lie, at least the area of the narrowest sector with this range."""
     axis_rad: float = 0.0
-    """Direction of the middle of its sector, 0 along the axis of the frame of its detections."""
+    """Direction of the middle of the sector, 0 along the x axis of the detections' frame."""
     field_of_view_rad: float | None = None
-    """Full angle of its sector; None where it detects all around, or too seldom to judge."""
+    """Full angle of the sector; None if the sensor detects all around, or if there are too few detections."""
     range_m: float | None = None
-    """Up to where it detects; None where it measures no range, or too seldom."""
+    """Range up to which the sensor detects; None if it measures no range, or if there are too few detections."""
 
 
 def coverages(
     messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None
 ) -> dict[str, Coverage]:
-    """Coverage of each sensor in `messages`, by name; `mounts` are the known ones.
-    - Only a detection that comes back counts: another list of the sensor has one close by and soon, as of an object and
-      seldom of clutter. With fewer than 100 of them nothing is estimated.
-    - The sector is the rest of the circle beside the widest arc with at most 1 % of these, up to 160 degrees:
-      one car that overtakes has a sensor which looks all around detect in nearly half a circle.
-    - Cars pass its edges within a few lists. So it goes on as far as the detections in that arc follow one another
-      within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is.
-    - The range is the quantile of 99 %, and a tenth more. Detections in the map give neither without an ego.
+    """Estimate the coverage of each sensor in `messages`, by name; `mounts` contains the known mounts.
+
+    - Only recurring detections count: another list of the sensor has a detection close by and soon. This is usual for
+      an object and rare for clutter. With fewer than 100 recurring detections nothing is estimated.
+    - The sector is the complement of the widest arc that contains at most 1 % of the recurring detections. The widest
+      sector is 160 degrees, because a single overtaking car covers nearly half a circle, whatever the field of view.
+    - Cars cross the edge of the sector within a few lists. So the sector is extended into this arc while successive
+      detections are closer than 12 degrees, and closer than a third of their distance if clutter were spread evenly.
+    - The range is the 99 % quantile plus a tenth. Detections in the map give neither sector nor range without an ego.
     """
-    ego, received = array("d"), defaultdict[str, _Detections](_Detections)
+    ego = array("d")
+    received = defaultdict[str, _Detections](_Detections)
     first_ns: int | None = None
     for message in messages:
         first_ns = message.receipt_ns if first_ns is None else first_ns
@@ -125,15 +150,14 @@ def coverages(
         for name, item in result.items()
         if item.persistence is not None
     }
-    for name, own in measured.items():
-        apart_m = [
-            disagreement_m(item, own.lists)
+    for name, one in measured.items():
+        disagreements_m = [
+            disagreement_m(item, one.lists)
             for other, item in measured.items()
             if other != name
         ]
-        result[name] = replace(
-            result[name], disagreement_m=min(filter(None, apart_m), default=None)
-        )
+        smallest_m = min(filter(None, disagreements_m), default=None)
+        result[name] = replace(result[name], disagreement_m=smallest_m)
     return result
 
 
@@ -141,15 +165,19 @@ class _Detections:
     """The detections of one sensor, in order of receipt."""
 
     def __init__(self) -> None:
-        self.measured, self.frames, self.boxes = set[str](), set[str](), False
+        self.measured = set[str]()
+        self.frames = set[str]()
+        self.boxes = False
         self.lists = array("q")
         """Stamp, receipt and number of detections of each list."""
         self.rows = array("d")
-        """Index of its list, x, y (of a bearing alone those of a unit vector), whether it has a range, and score (NaN
-        without one) of each detection with a bearing."""
+        """Index of the list, x, y, 1 if there is a range else 0, and score (NaN if missing) of each detection.
+
+        A detection with only a bearing has the x and y of a unit vector; a detection without a bearing is left out.
+        """
 
     def add(self, message: DetectionList) -> None:
-        """Take the detections of a list."""
+        """Add the detections of a list."""
         index = len(self.lists) // 3
         self.lists.extend((message.stamp_ns, message.receipt_ns, len(message.objects)))
         if message.objects:
@@ -167,25 +195,21 @@ class _Detections:
     def coverage(
         self, first_ns: int, path: FloatArray, mount: Mount | None
     ) -> Coverage:
-        """Return the coverage, with the ego's `path`: seconds since `first_ns`, x, y and yaw, shape (n, 4)."""
+        """Estimate the coverage; `path` contains seconds since `first_ns`, x, y and yaw of the ego, shape (n, 4)."""
         stamps_ns, receipts_ns, counts = np.array(self.lists).reshape(-1, 3).T
-        stamps_s, receipts_s = (
-            (stamps_ns - first_ns) / NS_PER_S,
-            (receipts_ns - first_ns) / NS_PER_S,
-        )
+        stamps_s = (stamps_ns - first_ns) / NS_PER_S
+        receipts_s = (receipts_ns - first_ns) / NS_PER_S
         rows = np.array(self.rows).reshape(-1, 5)
         ranged = rows[rows[:, 3] > 0.0]
-        begins = np.searchsorted(
-            ranged[:, 0], np.arange(len(counts) + 1)
-        )  # rows stand list by list
+        # The rows are sorted by list.
+        begins = np.searchsorted(ranged[:, 0], np.arange(len(counts) + 1))
         parts = [slice(*ends) for ends in pairwise(begins)]
-        num_lists, gaps_s, span_s = (
-            len(counts),
-            np.diff(np.sort(stamps_s)),
-            float(np.ptp(receipts_s)),
-        )
+        num_lists = len(counts)
+        gaps_s = np.diff(np.sort(stamps_s))
+        span_s = float(np.ptp(receipts_s))
         sides_m = np.ptp(ranged[:, 1:3], axis=0) if len(ranged) else np.zeros(2)
-        enough, has_area = num_lists >= _FEWEST_LISTS, bool(sides_m.all())
+        has_enough_lists = num_lists >= _FEWEST_LISTS
+        has_area = bool(sides_m.all())
         singles = np.count_nonzero(counts == 1)
         result = Coverage(
             frozenset(self.measured),
@@ -194,48 +218,49 @@ class _Detections:
             self.boxes,
             rate_hz=(num_lists - 1) / span_s if span_s > 0.0 else None,
             silence_s=float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0)),
-            scans=not enough
+            scans=not has_enough_lists
             or not counts.all()
             or bool(singles < _REPORTS_SHARE * num_lists),
             density_per_m2=float(counts.sum() / num_lists / np.prod(sides_m))
-            if enough and has_area
+            if has_enough_lists and has_area
             else math.inf,
             revisit_s=_revisit_s(
                 stamps_ns.tolist(), [ranged[part, 1:3] for part in parts]
             ),
         )
-        rows, in_map = ranged if len(ranged) else rows, "map" in self.frames
+        rows = ranged if len(ranged) else rows
+        in_map = "map" in self.frames
         if len(self.frames) != 1 or len(rows) < _FEWEST or (in_map and not len(path)):
             return result
-        numbers, seen_m = rows[:, 0].astype(np.int64), rows[:, 1:3]
-        placed_m = seen_m
+        numbers = rows[:, 0].astype(np.int64)
+        seen_m = rows[:, 1:3]
+        map_m = seen_m
         if len(path):
             x_m, y_m, yaw_rad = (
                 np.interp(stamps_s[numbers], path[:, 0], column)
                 for column in path[:, 1:].T
             )
             if not in_map:
-                placed_m = _turned(seen_m, yaw_rad) + np.column_stack([x_m, y_m])
+                map_m = _rotated(seen_m, yaw_rad) + np.column_stack([x_m, y_m])
             elif len(ranged):
-                seen_m = _turned(seen_m - np.column_stack([x_m, y_m]), -yaw_rad)
+                seen_m = _rotated(seen_m - np.column_stack([x_m, y_m]), -yaw_rad)
         if mount is not None and "sensor" not in self.frames:
             seen_m = (
                 seen_m - np.array([mount.x_m, mount.y_m]) if len(ranged) else seen_m
             )
-            seen_m = _turned(seen_m, np.full(len(seen_m), -mount.yaw_rad))
+            seen_m = _rotated(seen_m, np.full(len(seen_m), -mount.yaw_rad))
         if len(ranged):
             extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(
                 seen_m, _OUTSIDE, axis=0
             )
             ranges_m = np.hypot(*seen_m.T)
             reach_m = float(np.quantile(ranges_m, 1.0 - _OUTSIDE))
-            area_m2 = max(
-                float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2
-            )  # an object may stand
+            # An object at rest would give an extent of 0.
+            area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)
             order = np.argsort(stamps_s, kind="stable")
             columns = (
                 [column[parts[k]] for k in order]
-                for column in (placed_m, rows[:, 4], ranges_m)
+                for column in (map_m, rows[:, 4], ranges_m)
             )
             result = replace(
                 result,
@@ -246,7 +271,7 @@ class _Detections:
         cell_s = max(_CELL_S, _CELL_PERIODS * period_s)
         cell = _CELL_M + _CELL_MPS * cell_s if len(ranged) else _CELL_BEARING
         seen_m = seen_m[
-            _comes_back(
+            _recurring(
                 np.column_stack([seen_m / cell, receipts_s[numbers] / cell_s]), numbers
             )
         ]
@@ -269,13 +294,17 @@ class _Detections:
 def _revisit_s(
     stamps_ns: Sequence[int], points_m: Sequence[FloatArray]
 ) -> float | None:
-    """Median time since the last list with a detection that could be the same object, in lists in order of receipt."""
+    """Median time since the last list with a detection that could be the same object; None for too few revisits.
+
+    The lists are in order of receipt.
+    """
     lists = [
         (stamp_ns, points)
         for stamp_ns, points in zip(stamps_ns, points_m, strict=True)
         if len(points)
     ]
-    result, first = list[float](), 0
+    result = list[float]()
+    first = 0
     for k, (stamp_ns, points) in enumerate(lists):
         if len(result) >= _MOST_REVISITS:
             break
@@ -295,7 +324,7 @@ def _revisit_s(
 
 
 def _position(detection: Detection) -> tuple[float, float, float]:
-    """x, y and 1 of a position; cosine, sine and 0 of a bearing alone; NaN of neither."""
+    """x, y and 1 for a position; cosine, sine and 0 for a bearing without a range; NaN if there is neither."""
     if detection.x_m is not None and detection.y_m is not None:
         return detection.x_m, detection.y_m, 1.0
     if detection.bearing_rad is None:
@@ -305,15 +334,19 @@ def _position(detection: Detection) -> tuple[float, float, float]:
     return length * cosine, length * sine, float(detection.range_m is not None)
 
 
-def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
-    """Vectors, shape (n, 2), each turned by its angle, shape (n,)."""
+def _rotated(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """Return `vectors_m`, shape (n, 2), each rotated by its angle, shape (n,)."""
     cosine, sine = np.cos(angles_rad), np.sin(angles_rad)
     x_m, y_m = vectors_m.T
     return np.column_stack([cosine * x_m - sine * y_m, sine * x_m + cosine * y_m])
 
 
-def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
-    """True for `points`, shape (n, 3), in a cell of one of two shifted grids with one of another list of `numbers`."""
+def _recurring(points: FloatArray, numbers: IntArray) -> BoolArray:
+    """Mask (n,) of the recurring detections: another list has a detection in the same cell of either grid.
+
+    The two grids are shifted by half a cell. `points`, shape (n, 3), are in units of
+    the cells, `numbers` are the indices of their lists.
+    """
     result = np.zeros(len(points), dtype=bool)
     for shift in (0.0, 0.5):
         cells = np.unique(np.floor(points + shift), axis=0, return_inverse=True)[
@@ -325,7 +358,7 @@ def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
 
 
 def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] | None:
-    """Axis and full angle of the sector of these bearings; None where it is too wide for one."""
+    """Axis and full angle of the sector that contains the bearings; None if it is too wide to be distinguished."""
     rising = np.sort(wrap_angles(bearings_rad))
     skip = 1 + int(_OUTSIDE * len(rising))
     ends = np.append(rising, rising[:skip] + math.tau)
@@ -333,16 +366,19 @@ def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] |
     widest = int(np.argmax(gaps_rad))
     if gaps_rad[widest] < math.tau - _WIDEST_RAD:
         return None
-    blind_rad = ends[widest : widest + skip + 1]  # its edges, and the detections in it
-    apart = np.flatnonzero(
+    # The edges of the widest arc, and the detections in it.
+    blind_rad = ends[widest : widest + skip + 1]
+    gaps = np.flatnonzero(
         np.diff(blind_rad) > min(_LINK_RAD, float(gaps_rad[widest]) / (3.0 * skip))
     )
-    left_rad, right_rad = float(blind_rad[apart[0]]), float(blind_rad[apart[-1] + 1])
+    left_rad = float(blind_rad[gaps[0]])
+    right_rad = float(blind_rad[gaps[-1] + 1])
     half_rad = 0.5 * (math.tau - (right_rad - left_rad))
     middle_rad = wrap_angle(right_rad + half_rad)
     nearest_rad = 0.0 if axis_known else _AXES_RAD * round(middle_rad / _AXES_RAD)
     off_rad = abs(wrap_angle(middle_rad - nearest_rad))
     if axis_known or off_rad <= _AXIS_TOLERANCE_RAD:
-        middle_rad, half_rad = wrap_angle(nearest_rad), half_rad + off_rad
+        middle_rad = wrap_angle(nearest_rad)
+        half_rad += off_rad
     full_rad = max(math.ceil(200.0 * half_rad) / 100.0, _NARROWEST_RAD)
     return None if full_rad >= math.tau else (round(middle_rad, 2), full_rad)

@@ -1,4 +1,8 @@
-"""Persistence of detections from list to list: detection probability, clutter and score of a sensor, without tracks."""
+"""Estimates detection probability, clutter and score model of a sensor from the persistence of its detections.
+
+Persistence means that the detections of an object recur from list to list; no tracks
+are needed.
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,63 +20,72 @@ if TYPE_CHECKING:  # takes half a second to import
 
 __all__ = ["Lists", "Persistence", "disagreement_m", "persistence"]
 
+#: Highest speed of an object.
 _FASTEST_MPS = 90.0
 _LARGEST_ERROR_M = 3.0
-"""Between two detections of one object, beside what it moves."""
+"""Largest difference of the errors of two detections of one object."""
 _MOST_CENTRES = 3_000
-"""Detections whose neighbours are looked for; of longer recordings every n-th list is a centre."""
+"""Most detections whose neighbours are searched; in a longer recording only every n-th list contains centres."""
+#: Fewest samples for an estimate, and fewest triples beyond an estimated maximum range.
 _FEWEST = 30
 _FEWEST_FAR = 5
 _BESIDE_M = np.array([20.0, 20.0])
-"""Farther than the hull of any object but large ships."""
+"""Offset of a reference point next to an object, longer than the hull of all objects but large ships."""
 _CROWD_M = 50.0
-"""Clutter comes in crowds, as of a shore or a hedge: what competes with a track is the clutter so near to clutter."""
+"""Radius of crowds of clutter, for example at a shore or a hedge, in which clutter competes with a track."""
 _CORE = 3.5
-"""Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
+"""Largest second difference of one object's positions, in multiples of the scale: 99.8 % of a Rayleigh distribution."""
 _PROBABILITY = (0.1, 0.9)
-"""Bounds of the detection probability: what hides an object hides it from several lists in a row."""
+"""Bounds of the detection probability: it is uncertain, because an occlusion lasts for several lists."""
 
 
 class Lists(NamedTuple):
-    """Positions in the lists of a sensor, in a frame that does not turn."""
+    """Positions in the lists of a sensor, in a frame with constant orientation."""
 
     stamps_s: FloatArray
-    """Rising, shape (n,)."""
+    """Ascending stamps, shape (n,)."""
     points_m: Sequence[FloatArray]
-    """Shape (m, 2) each."""
+    """Positions in each list, shape (m, 2)."""
     scores: Sequence[FloatArray]
-    """NaN where absent, shape (m,) each."""
+    """Scores in each list, shape (m,); NaN where missing."""
     ranges_m: Sequence[FloatArray]
-    """From the sensor, NaN where unknown, shape (m,) each."""
+    """Distances from the sensor in each list, shape (m,); NaN where unknown."""
 
 
 @dataclass(frozen=True)
 class Persistence:
-    """Detection probability, clutter and scores of a sensor, from triples of detections in three successive lists.
-    Three detections on a line at constant speed are of one object. How often the next lists continue the line is the
-    detection probability; detections in no triple, beyond those that misses explain, are clutter. Where scores identify
-    clutter, its density is also that around clutter, where it competes with a track that began there (Song, Musicki:
-    Adaptive clutter measurement density estimation for improved target tracking, IEEE T-AES 2011).
+    """Detection probability, clutter and score model of a sensor, from triples of detections in successive lists.
+
+    Three detections in successive lists, on a straight line at constant speed, belong
+    to one object. The detection probability is the frequency with which the next lists
+    continue this line. Detections in no triple are clutter, apart from those that
+    missed detections explain. If scores identify clutter, its density is estimated
+    around other clutter too, where it competes with tracks that began there (Song,
+    Musicki: Adaptive clutter measurement density estimation for improved target
+    tracking, IEEE T-AES 2011).
     """
 
     detection_probability: float
     clutter_per_list: float
     near_clutter_per_m2: float
-    """Clutter around clutter: in the next list where scores identify it, else in the same list."""
+    """Density of clutter around clutter: in the next list if scores identify clutter, else in the same list."""
     score: Score | None
-    """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
+    """Score model; None if scores are missing, or higher scores do not belong to objects more often."""
     max_range_m: float | None
-    """Range beyond which most triples do not go on, so that clutter outweighs objects; None where they do at any."""
+    """Range beyond which most triples are not continued, so clutter outnumbers objects; None if continued anywhere."""
     lines: FloatArray
     """Stamp, position and velocity at the end of each triple, shape (n, 5)."""
     std_m: float
-    """Standard deviation of a detection, per axis, of errors that differ from list to list."""
+    """Standard deviation of a detection on each axis, of the errors that are independent from list to list."""
     lists: Lists
 
 
 def disagreement_m(one: Persistence, other: Lists) -> float | None:
-    """Standard deviation, per axis, of where another sensor, with the lists `other`, sees the objects of `one`.
-    None unless pairs of mutual nearest neighbours are nearer than points beside them.
+    """Standard deviation on each axis between positions of the objects of `one` and their detections in `other`.
+
+    `other` contains the lists of another sensor. Pairs are mutual nearest neighbours.
+    Returns None if there are few pairs, or if their distances are not clearly smaller
+    than distances from a reference point next to the object.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
@@ -96,20 +109,21 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
 
 
 def persistence(lists: Lists) -> Persistence | None:
-    """Persistence of detections; None where too few detections follow one another."""
+    """Estimate the persistence of detections; None if too few detections recur in successive lists."""
     from scipy.spatial import cKDTree
 
-    stamps_s, points_m = lists.stamps_s, lists.points_m
+    stamps_s = lists.stamps_s
+    points_m = lists.points_m
     trees = [cKDTree(points) for points in points_m]
     every = max(1, math.ceil(sum(map(len, points_m)) / _MOST_CENTRES))
     centres = range(1, len(stamps_s) - 3, every)
-    misfits, scores, ranges_m = list[float](), list[float](), list[float]()
+    misfits = list[float]()
+    scores = list[float]()
+    ranges_m = list[float]()
     lines: list[tuple[int, FloatArray, FloatArray]] = []
     for k in centres:
-        before_s, after_s = (
-            float(stamps_s[k] - stamps_s[k - 1]),
-            float(stamps_s[k + 1] - stamps_s[k]),
-        )
+        before_s = float(stamps_s[k] - stamps_s[k - 1])
+        after_s = float(stamps_s[k + 1] - stamps_s[k])
         if min(before_s, after_s) <= 0.0:
             continue
         scores += lists.scores[k].tolist()
@@ -123,10 +137,12 @@ def persistence(lists: Lists) -> Persistence | None:
     misfit = np.array(misfits)
     scale = _scale(misfit[np.isfinite(misfit)])
     in_triple = misfit <= _CORE * scale
-    num_triples, reach_m = int(in_triple.sum()), _CORE * scale * math.sqrt(6.0)
+    num_triples = int(in_triple.sum())
+    reach_m = _CORE * scale * math.sqrt(6.0)
     if num_triples < _FEWEST:
         return None
-    hits, of_object = 0, np.zeros(len(misfit), dtype=bool)
+    hits = 0
+    of_object = np.zeros(len(misfit), dtype=bool)
     for row in np.flatnonzero(in_triple).tolist():
         k, end_m, velocity_mps = lines[row]
         ahead_m = [
@@ -141,13 +157,10 @@ def persistence(lists: Lists) -> Persistence | None:
         of_object[row] = all(seen)
     share = (hits + 1) / (2 * num_triples + 2)
     probability = float(np.clip(share, *_PROBABILITY))
-    of_objects = min(
-        num_triples / probability**2, float(len(misfit))
-    )  # the others' neighbours were missed
-    of_clutter, model = (
-        len(misfit) - of_objects,
-        _score(np.array(scores), of_object, ~in_triple),
-    )
+    # A detection of an object is in a triple if both its neighbours are detected.
+    of_objects = min(num_triples / probability**2, float(len(misfit)))
+    of_clutter = len(misfit) - of_objects
+    model = _score(np.array(scores), of_object, ~in_triple)
     if model is not None:
         near = _near_clutter_per_m2(
             trees, lists.scores, model, len(misfit) / max(of_objects, 1.0) - 1.0
@@ -175,7 +188,11 @@ def _crowding_per_m2(
     loose: BoolArray,
     of_clutter: float,
 ) -> float:
-    """Density of clutter around clutter in its list: `of_clutter` of the `loose` detections of the lists `numbers`."""
+    """Density of clutter around clutter in the same list.
+
+    `loose` marks detections in no triple; `of_clutter` of them are clutter. `numbers`
+    contains the list of each detection.
+    """
     from scipy.spatial import cKDTree
 
     num_loose, pairs = max(int(loose.sum()), 1), 0
@@ -188,28 +205,34 @@ def _crowding_per_m2(
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
-    """Range beyond which, however far, most triples go on by chance, given how many `objects` each stands for."""
+    """Range beyond which most triples are not continued; None if there is no such range.
+
+    `objects` contains the number of objects that the continuation of each triple
+    indicates.
+    """
     known = np.isfinite(ranges_m)
     order = np.argsort(ranges_m[known])
     surplus = np.cumsum(objects[known][order] - 0.5)
     best = int(np.argmax(surplus)) if len(surplus) else 0
-    return (
-        float(ranges_m[known][order][best])
-        if len(surplus) - best > _FEWEST_FAR
-        else None
-    )
+    if len(surplus) - best <= _FEWEST_FAR:
+        return None
+    return float(ranges_m[known][order][best])
 
 
 def _near_clutter_per_m2(
     trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float
 ) -> float:
-    """Density of clutter of the next list around that of each; before their scores the odds for clutter are `odds`."""
+    """Density of clutter in the next list around clutter, where scores give the probability of clutter.
+
+    `odds` are the odds of clutter before the score is known.
+    """
     ratios = [
         np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale)
         for item in scores
     ]
     of_clutter = [odds / (odds + ratio) for ratio in ratios]
-    total, together = sum(float(item.sum()) for item in of_clutter[:-1]), 0.0
+    total = sum(float(item.sum()) for item in of_clutter[:-1])
+    together = 0.0
     for (tree, own), (after, others) in pairwise(zip(trees, of_clutter, strict=True)):
         for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
             together += float(own[i] * others[near].sum())
@@ -223,13 +246,18 @@ def _best(
     before_s: float,
     after_s: float,
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Misfit (infinite without one) of the straightest triple about a detection; position and velocity at its end."""
+    """Return the misfit of the straightest triple around a detection, and position and velocity at its end.
+
+    The misfit is infinite if there is no triple.
+    """
     near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
     if not near or not after.n:
         return math.inf, centre_m, centre_m
-    firsts_m, ratio = np.asarray(before.data)[near], after_s / before_s
+    firsts_m = np.asarray(before.data)[near]
+    ratio = after_s / before_s
     result = after.query(centre_m + ratio * (centre_m - firsts_m))
-    distances_m, ends = np.asarray(result[0]), np.asarray(result[1])
+    distances_m = np.asarray(result[0])
+    ends = np.asarray(result[1])
     best = int(np.argmin(distances_m))
     end_m = np.asarray(after.data)[ends[best]]
     velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)
@@ -241,7 +269,10 @@ def _best(
 
 
 def _scale(misfits: FloatArray, start: float = 0.5) -> float:
-    """Scale of the Rayleigh distribution of the misfits without outliers; `start` is a quantile below these."""
+    """Scale of the Rayleigh distribution of the misfits, without outliers.
+
+    `start` is a quantile of the misfits that outliers do not reach.
+    """
     if not len(misfits):
         return 0.0
     scale = float(np.quantile(misfits, start)) / math.sqrt(-2.0 * math.log(1.0 - start))
@@ -255,16 +286,23 @@ def _scale(misfits: FloatArray, start: float = 0.5) -> float:
 def _score(
     scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray
 ) -> Score | None:
-    """Logistic fit to the scores of detections of objects and of clutter, less the odds of their numbers."""
+    """Logistic fit to the scores of objects and of clutter, corrected for the ratio of their numbers.
+
+    Returns None if there are too few scores, or if higher scores do not belong to
+    objects more often.
+    """
     from scipy.optimize import minimize
     from scipy.special import expit, log_expit
 
     known = np.isfinite(scores) & (of_object | of_clutter)
-    x, y = scores[known], of_object[known]
+    x = scores[known]
+    y = of_object[known]
     if min(y.sum(), (~y).sum()) < _FEWEST or np.ptp(x) == 0.0:
         return None
-    middle, width = float(np.median(x)), float(np.std(x))
-    z, sign = (x - middle) / width, np.where(y, 1.0, -1.0)
+    middle = float(np.median(x))
+    width = float(np.std(x))
+    z = (x - middle) / width
+    sign = np.where(y, 1.0, -1.0)
 
     def cost(p: FloatArray) -> tuple[float, FloatArray]:
         margin = sign * (p[0] + p[1] * z)
