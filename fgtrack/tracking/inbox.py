@@ -126,7 +126,7 @@ class FusedRecords:
 def is_usable(
     detection: Detection, sensor: SensorModel, at_origin: bool = False
 ) -> bool:
-    """True if `detection` has valid values, says where it is, and is not an empty slot (x = y = 0).
+    """True if `detection` has valid values and a measured one, and is not an empty slot (x = y = 0).
 
     A sensor that measures positions or bearings must give either. Another sensor, as of range rates alone, must give
     some value: the association finds its object.

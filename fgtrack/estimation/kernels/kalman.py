@@ -24,7 +24,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.models.measurement_kernels import GAUSSIAN, penalty_and_weight
 from fgtrack.models.transitions import check_noise, transition
 
-#: A weight is found by so many reweightings at most, until it changes by less than this share.
+#: Largest number of reweightings of one update, and the relative change of the weight at which they end.
 _MAX_REWEIGHTINGS, _REWEIGHTING_TOLERANCE = 50, 1e-9
 CORRECTION_SPACE = f"UniTuple({MATRIX}, 8)"
 CorrectionSpace = tuple[
