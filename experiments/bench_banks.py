@@ -14,8 +14,8 @@ from statistics import median
 import numpy as np
 
 import fgtrack
+from fgtrack import SensorPose
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.models.measurement import SensorPose
 
 NUM_OBJECTS = 50
 ESTIMATORS = ("ekf-replay", "smoother-banded")

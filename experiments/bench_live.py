@@ -26,7 +26,7 @@ from bench_report import plural, progress, short_machine, table
 from bench_tracker import yardstick_us
 
 import fgtrack
-from fgtrack.core.time import nanoseconds, period_ns
+from fgtrack import nanoseconds
 
 Sent = fgtrack.EgoState | fgtrack.DetectionList
 
@@ -132,7 +132,7 @@ def track(
     receiver: Receiver, hz: float, duration_s: float, num_parts: int
 ) -> list[Part]:
     """Tick at multiples of the period, from the first message until the vehicle has stopped."""
-    step_ns = period_ns(hz)
+    step_ns = round(1e9 / hz)
     receiver.begun.wait()
     begun_ns = due_ns = -(-time.time_ns() // step_ns) * step_ns
     parts: list[Part] = []

@@ -21,15 +21,18 @@ import typer
 from bench_report import plural, progress, short_machine, table
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
-from fgtrack.config.reading import read_config
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Message, TickReport
-from fgtrack.inputs.recording import write_recording
-from fgtrack.inputs.source import open_input
+from fgtrack import (
+    Config,
+    Message,
+    TickReport,
+    nanoseconds,
+    open_input,
+    simulate,
+    write_recording,
+)
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path as Track
 from fgtrack.pipeline.replay import replay
-from fgtrack.sim.simulate import simulate
 
 _MB = 1 << 20
 LAPS_START_NS = 1_700_000_000_000_000_000
@@ -41,9 +44,7 @@ def laps(objects: int, duration_s: float) -> Iterator[Message]:
     one_lap = scenario(objects, lap_s, speed_mps=speed_mps)
 
     def lap(number: int, begun_ns: int) -> Iterable[Message]:
-        return simulate(
-            replace(one_lap, start_ns=begun_ns), np.random.default_rng(number)
-        )
+        return list(simulate(replace(one_lap, start_ns=begun_ns), seed=number))
 
     return joined(lap, lap_s, int(np.ceil(duration_s / lap_s)))
 
@@ -99,8 +100,8 @@ def main(
 ) -> None:
     """Replay, print memory over the time of the recording."""
     out.mkdir(parents=True, exist_ok=True)
-    config = read_config(
-        "smoother", track_map="oval", pit_map="oval", estimator=estimator
+    config = Config.from_yaml("smoother").replace(
+        {"map.track": "oval", "map.pit": "oval"}, estimator=estimator
     )
     rows: list[
         tuple[float, float, float, int]

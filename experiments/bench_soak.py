@@ -27,24 +27,34 @@ from bench_tracker import NODE_HZ, yardstick_us
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import DetectionList, Disposition, EgoState, Message, TruthState
+from fgtrack import (
+    DetectionList,
+    Disposition,
+    EgoState,
+    Message,
+    TruthState,
+    nanoseconds,
+    simulate,
+)
 from fgtrack.estimation.failures import Failure
 from fgtrack.pipeline.clock import clock_ticks
 from fgtrack.runs.rows import Row, text
 from fgtrack.runs.sink import RunSink
-from fgtrack.sim.clocks import ArrivalClock, DriftClock, JitterClock, OffsetClock
-from fgtrack.sim.delays import (
+from fgtrack.sim import (
     LIDAR_DELAY,
     RADAR_DELAY,
+    ArrivalClock,
+    Clutter,
     ConstantDelay,
+    DriftClock,
+    JitterClock,
     LossyDelay,
     MarkovTimeDelay,
+    OffsetClock,
+    Scenario,
+    SimulatedSensor,
+    TrackVehicle,
 )
-from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.sensor import Clutter, SimulatedSensor
-from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
 
 Sent = EgoState | DetectionList
 
@@ -121,7 +131,9 @@ def messages(hours: float, seed: int) -> Iterator[Sent]:
 
     def lap(number: int, begun_ns: int) -> Iterable[Message]:
         (rng,) = laps_rng.spawn(1)
-        drawn = simulate(replace(race(rng, lap_s, speed_mps), start_ns=begun_ns), rng)
+        drawn = simulate(
+            replace(race(rng, lap_s, speed_mps), start_ns=begun_ns), seed=rng
+        )
         return [message for message in drawn if not isinstance(message, TruthState)]
 
     ends_ns = LAPS_START_NS + nanoseconds(3600.0 * hours)

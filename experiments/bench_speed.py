@@ -48,9 +48,7 @@ from bench_report import (
 )
 from bench_tracker import Cell, Measured, measure, scene, traffic
 
-from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.inputs.recording import write_recording
-from fgtrack.inputs.source import open_input
+from fgtrack import list_estimators, open_input, write_recording
 
 ALL_OBJECTS = (1, 2, 5, 10, 20, 50, 100, 200, 300, 1000)
 LAGS_S = (0.5, 1.0, 3.0)
@@ -97,7 +95,9 @@ def full_cells() -> list[Cell]:
         cell(label, 10, delay_s=delay_s) for label in MAIN for delay_s in DELAYS_S
     ]
     return cells + [
-        cell(name, 10, duration_s=_SHORT_S) for name in ESTIMATORS if name not in MAIN
+        cell(name, 10, duration_s=_SHORT_S)
+        for name in list_estimators()
+        if name not in MAIN
     ]
 
 

@@ -15,9 +15,8 @@ from bench_report import progress, short_machine, table
 from bench_tracker import scene, yardstick_us
 
 import fgtrack
-from fgtrack.core.types import Message
-from fgtrack.evaluation.tables import Tables, short
-from fgtrack.runs import Columns
+from fgtrack import Message, Tables
+from fgtrack.evaluation import Columns, short
 
 METHODS = ("smoother-banded", "smoother", "ekf-replay", "ekf-backward-forward")
 JUDGED = {

@@ -14,16 +14,17 @@ from statistics import median
 
 import numpy as np
 
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.types import DetectionList, Message, TruthState
+from fgtrack import Config, DetectionList, Message, TruthState, simulate
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Tick, clock_ticks
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay
-from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
+from fgtrack.sim import (
+    LIDAR_DELAY,
+    RADAR_DELAY,
+    ConstantDelay,
+    Scenario,
+    SimulatedSensor,
+    TrackVehicle,
+)
 
 NODE_HZ = 50.0
 SPEED_MPS = 65.0
@@ -68,14 +69,8 @@ class Cell:
                 f"sensors.{name}.max_delay_s": 1.0
                 for name in ("lidar_cluster", "radar")
             }
-        given = [f"{key}={json.dumps(value)}" for key, value in own.items()]
-        return read_config(
-            self.config,
-            given,
-            track_map="oval",
-            pit_map="oval",
-            estimator=self.estimator,
-        )
+        own |= {"map.track": "oval", "map.pit": "oval"}
+        return Config.from_yaml(self.config).replace(own, estimator=self.estimator)
 
 
 @dataclass(frozen=True)
@@ -106,7 +101,7 @@ def traffic(count: int, duration_s: float, delay_s: float | None = None) -> list
 
 def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[Message]:
     """Messages of `scenario` in order of receipt, truth included."""
-    return simulate(scenario(count, duration_s, delay_s), np.random.default_rng(0))
+    return list(simulate(scenario(count, duration_s, delay_s), seed=0))
 
 
 def scenario(

@@ -16,11 +16,9 @@ from typing import Annotated
 import typer
 
 import fgtrack
-from fgtrack.config.yaml_file import validate
-from fgtrack.evaluation.intervals import average
-from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scores.innovations import Consistency
-from fgtrack.sim.scenario import Scenario
+from fgtrack import evaluate, read_scenario
+from fgtrack.evaluation import Consistency, average
+from fgtrack.sim import Scenario
 
 HERE = Path(__file__).parent
 
@@ -99,7 +97,7 @@ def turning_ego(mount: tuple[float, float], duration_s: float) -> Scenario:
         "opponents": opponents,
         "sensors": [sensor],
     }
-    return validate(Scenario, raw, "the turning ego")
+    return read_scenario(raw)
 
 
 def lever_arm(seeds: int, duration_s: float) -> str:

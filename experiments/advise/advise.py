@@ -15,14 +15,17 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.metrics import evaluate
-from fgtrack.inputs.recording import write_recording
-from fgtrack.runs import Run
-from fgtrack.sim.redelay import restamped
+from fgtrack import (
+    Config,
+    DetectionList,
+    Message,
+    Run,
+    evaluate,
+    nanoseconds,
+    write_recording,
+)
+from fgtrack.evaluation import average, paired
+from fgtrack.sim import restamped
 
 OFFSET_S = 0.08
 SEEDS = 8
@@ -90,7 +93,9 @@ def followed(
     recording: Path, config: str | None, track_map: str | None, tune: bool
 ) -> Followed:
     """Scores before and after the advice is followed, and what it changes."""
-    resolved = read_config(config, track_map=track_map, pit_map=track_map)
+    resolved = Config.from_yaml(config).replace(
+        {"map.track": track_map, "map.pit": track_map}
+    )
     if resolved.estimator == "smoother":  # the same numbers, sooner
         resolved = replace(resolved, estimator="smoother-banded")
     advice = fgtrack.advise(recording, resolved, tune=tune)

@@ -11,12 +11,15 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from fgtrack.core.geometry import rotation
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.birth import initial_state
-from fgtrack.models.motion import CTRV
+from fgtrack import (
+    CTRV,
+    FloatArray,
+    Measurement,
+    Start,
+    initial_state,
+    nanoseconds,
+    rotation,
+)
 from fgtrack.noise.likelihood.fit import Problem
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
 

@@ -32,20 +32,27 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 
-from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
-from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
-from fgtrack.estimation.birth import initial_state
+from fgtrack import (
+    CTRV,
+    NS_PER_S,
+    FloatArray,
+    IntArray,
+    Measurement,
+    Start,
+    StatesAt,
+    TrackBank,
+    initial_state,
+    measurement_model,
+    nanoseconds,
+    seconds,
+)
+from fgtrack.config import GatedEuclidean, GatedMahalanobis
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV
-from fgtrack.show.figures.paper import styled
-from fgtrack.show.figures.style import log_axis, save
-from fgtrack.show.palette import PALETTE
-from fgtrack.sim.vehicles import draw_states
-from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
+from fgtrack.show import PALETTE, log_axis, save, styled
+from fgtrack.sim import draw_states
+from fgtrack.tracking.association import Association
 from fgtrack.tracking.preprocess import Candidates, Group
 
 START_NS = 1_790_000_000 * NS_PER_S

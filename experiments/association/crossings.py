@@ -22,12 +22,18 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.config.settings import Config
-from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import Detection, DetectionList, FloatArray, Message, TruthState
-from fgtrack.evaluation.matching import Scenes
-from fgtrack.evaluation.scores.multi_object import clear, gospa
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, draw_delays
+from fgtrack import (
+    NS_PER_S,
+    Config,
+    Detection,
+    DetectionList,
+    FloatArray,
+    Message,
+    TruthState,
+    nanoseconds,
+)
+from fgtrack.evaluation import Scenes, clear, gospa
+from fgtrack.sim import LIDAR_DELAY, RADAR_DELAY, draw_delays
 
 START_NS = 1_790_000_000 * NS_PER_S
 CARS_PER_LANE, HEADWAY_M, LANE_M = 10, 8.0, 3.5

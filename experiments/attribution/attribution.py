@@ -17,16 +17,22 @@ import joblib
 import numpy as np
 import typer
 
-from fgtrack.core.linalg import mahalanobis_squared
-from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.registry import estimator
-from fgtrack.evaluation.intervals import Estimate, average, paired
-from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
-from fgtrack.models.motion import CTRV
-from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    NS_PER_S,
+    Estimator,
+    FloatArray,
+    Measurement,
+    RobustLoss,
+    SensorPose,
+    Start,
+    estimator,
+    measured_position,
+    measurement_model,
+    nanoseconds,
+)
+from fgtrack.evaluation import Estimate, average, paired
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 HUBER = RobustLoss("huber", 1.5)
@@ -277,7 +283,9 @@ def score(contestant: Contestant, run: Drawn) -> "Score":
             error = state.mean[:2] - run.truth[at_ns][:2]
             squares[at_ns] = float(error @ error)
             if at_ns == now_ns:
-                nees.append(float(mahalanobis_squared(error, state.covariance[:2, :2])))
+                nees.append(
+                    float(error @ np.linalg.solve(state.covariance[:2, :2], error))
+                )
     then_m2 = [now_m2[at_ns] for at_ns in ago_m2]
     return Score(
         *(

@@ -19,15 +19,20 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
-from fgtrack.core.geometry import rotation
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.registry import ESTIMATORS, estimator
-from fgtrack.evaluation.intervals import average, paired
-from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CV
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CV,
+    NS_PER_S,
+    FloatArray,
+    Measurement,
+    SensorPose,
+    Start,
+    estimator,
+    list_estimators,
+    measurement_model,
+    rotation,
+)
+from fgtrack.evaluation import average, paired
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 FIRST_BEARING_RAD = np.deg2rad(10.0)
@@ -187,7 +192,7 @@ def errors(world: World, name: str, drawn: Pursuit) -> Errors:
 
 def chosen(names: str | None) -> list[str]:
     """The cases of `names`, separated by semicolons, or all whose estimator there is."""
-    there = [name for name, (entry, _) in CASES.items() if entry in ESTIMATORS]
+    there = [name for name, (entry, _) in CASES.items() if entry in list_estimators()]
     return there if names is None else [name.strip() for name in names.split(";")]
 
 

@@ -18,17 +18,21 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.scores.lagged import lag_metrics
-from fgtrack.models.motion import CTRV
-from fgtrack.models.sensors import Correlation, Mount, SensorModel
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    NS_PER_S,
+    Config,
+    Detection,
+    DetectionList,
+    EgoState,
+    Message,
+    SensorModel,
+    TruthState,
+    wrap_angle,
+)
+from fgtrack.config import Correlation, Mount
+from fgtrack.evaluation import average, lag_metrics, match, paired
+from fgtrack.sim import draw_states
 
 MOTION = CTRV(0.01, 0.001, 0.5, 0.01)
 STARTS = np.array(
@@ -140,7 +144,9 @@ def configuration(modelled: str) -> Config:
             ("position", "yaw", "speed", "yaw_rate"), CTRV.density_names(), strict=True
         )
     }
-    base = read_config("open_space", ["clock.node_hz=10", "association.gate_m=15"])
+    base = Config.from_yaml("open_space").replace(
+        {"clock.node_hz": 10, "association.gate_m": 15}
+    )
     sensors = {
         name: replace(camera, mount=mount, correlation=correlation)
         for name, mount in MOUNTS.items()

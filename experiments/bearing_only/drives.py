@@ -19,25 +19,26 @@ import numpy as np
 import typer
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.geometry import rotation, wrap_angle
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import (
+from fgtrack import (
+    CTRV,
+    Config,
     Detection,
     DetectionList,
     EgoState,
+    Estimator,
     FloatArray,
+    Measurement,
+    SensorPose,
+    Start,
     TruthState,
+    estimator,
+    measurement_model,
+    nanoseconds,
+    open_input,
+    rotation,
+    wrap_angle,
 )
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.registry import estimator
-from fgtrack.evaluation.intervals import by_stamp, within_run
-from fgtrack.evaluation.matching import Matching, match
-from fgtrack.evaluation.scores.lagged import lag_metrics
-from fgtrack.inputs.source import open_input
-from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CTRV
+from fgtrack.evaluation import Matching, by_stamp, lag_metrics, match, within_run
 
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 LIDAR, CAMERA = "pointrcnn_car", "rrc_car"
@@ -102,7 +103,7 @@ CASES = {
 
 def sightings(kitti: Path, sequence: str) -> dict[int, list[Sighting]]:
     """What was seen of every labelled car, in order of time."""
-    config = read_config("kitti")
+    config = Config.from_yaml("kitti")
     mount, settings = (
         config.sensors[CAMERA].mount,
         replace(config.input.kitti, sequence=sequence),
@@ -382,7 +383,7 @@ def main(
         ]
         writer.writerow(["sequence", "with", *header])
         for sequence in sequences.split(","):
-            for label, config in cures(read_config("kitti")).items():
+            for label, config in cures(Config.from_yaml("kitti")).items():
                 writer.writerow(
                     [
                         sequence,

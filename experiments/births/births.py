@@ -16,13 +16,18 @@ from joblib import Parallel, delayed
 from matplotlib.ticker import LogFormatter
 
 import fgtrack
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.evaluation.intervals import Estimate
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    CV,
+    NS_PER_S,
+    FloatArray,
+    Measurement,
+    MotionModel,
+    Start,
+    measurement_model,
+)
+from fgtrack.evaluation import Estimate
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05

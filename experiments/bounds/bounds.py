@@ -24,19 +24,29 @@ import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fgtrack.core.errors import CallError
-from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
-from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
-from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.show.figures.paper import styled
-from fgtrack.show.figures.style import GREY, WRONG, save
-from fgtrack.show.palette import style_of
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    CV,
+    NS_PER_S,
+    CallError,
+    Estimator,
+    FloatArray,
+    IntArray,
+    Measurement,
+    MotionModel,
+    ScheduledMeasurement,
+    Start,
+    bounds,
+    bounds_along,
+    estimator,
+    initial_state,
+    list_estimators,
+    measurement_model,
+    nanoseconds,
+    seconds,
+)
+from fgtrack.show import GREY, WRONG, save, style_of, styled
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 POOR_PERIOD_S, GOOD_PERIOD_S, GOOD_PHASE_S = 0.05, 0.1, 0.025
@@ -110,7 +120,7 @@ def starts(motion: MotionModel, delay_s: float) -> dict[str, Callable[[], Estima
         name: lambda name=name: estimator(
             name, motion, PRIOR, lag_s=LAG_S, **options.get(name, {})
         )
-        for name in ("ekf-replay", "smoother", *ESTIMATORS.loaded(OOSM_GROUP))
+        for name in ("ekf-replay", "smoother", *list_estimators("fgtrack.oosm"))
     }
 
 

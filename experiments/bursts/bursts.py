@@ -15,9 +15,9 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 
-from fgtrack.cli.sweep import swept
-from fgtrack.core.types import FloatArray
-from fgtrack.show.palette import style_of
+import fgtrack
+from fgtrack import FloatArray
+from fgtrack.show import style_of
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/bursts.yaml"
 QUICK_SEEDS = 2
@@ -80,7 +80,9 @@ def main(
     ] = False,
 ) -> None:
     """Write bursts.csv and bursts.png beside sweep.csv."""
-    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
+    rows = fgtrack.sweep(SWEEP, out, num_seeds=QUICK_SEEDS if quick else None).to_dict(
+        "records"
+    )
     found, fused = values(rows, (RMSE,)), values(rows, FUSED)
     lengths_s = sorted({length_s for _, share, length_s, _ in found if share > 0.0})
     with (out / "bursts.csv").open("w", newline="") as file:

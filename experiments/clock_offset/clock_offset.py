@@ -17,15 +17,8 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
-from fgtrack.clocks.offsets import estimate_offsets
-from fgtrack.config.reading import read_scenario
-from fgtrack.config.settings import Config
-from fgtrack.config.yaml_file import load
-from fgtrack.core.time import nanoseconds
-from fgtrack.sim.clocks import OffsetClock
-from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
+from fgtrack import Config, estimate_offsets, nanoseconds, read_scenario, simulate
+from fgtrack.sim import OffsetClock, Scenario, TrackVehicle
 
 WRONG, REFERENCE = "lidar_cluster", "radar"
 OFFSETS_S = (-0.04, 0.0, 0.04)
@@ -57,8 +50,8 @@ def scenario(name: str, offset_s: float) -> Scenario:
 
 def configuration() -> Config:
     """The smoother's, with what the simulated sensors are really like."""
-    config = load(
-        Config, Path("configs/smoother.yaml"), ["map.track=oval", "map.pit=oval"]
+    config = Config.from_yaml("configs/smoother.yaml").replace(
+        {"map.track": "oval", "map.pit": "oval"}
     )
     std = {one.name: one.std for one in read_scenario("default").sensors}
     return replace(
@@ -86,7 +79,7 @@ def rows(
 ) -> Iterator[Row]:
     """An estimate for each length of one recording; NaN where there is none."""
     made = scenario(name, true_s)
-    messages = simulate(made, np.random.default_rng(seed))
+    messages = list(simulate(made, seed=seed))
     for length_s in lengths_s:
         end_ns = made.start_ns + nanoseconds(length_s)
         report = estimate_offsets(

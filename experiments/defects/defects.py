@@ -12,11 +12,7 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.config.settings import Config
-from fgtrack.config.yaml_file import load
-from fgtrack.evaluation.metrics import evaluate
-from fgtrack.pipeline.public import replay
-from fgtrack.runs import Run
+from fgtrack import Config, Run, evaluate, replay
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -100,9 +96,9 @@ def main(
     out: Annotated[Path, typer.Option("-o", "--out")] = Path("out/defects"),
 ) -> None:
     """Print the table as Markdown; the runs stay in OUT."""
-    maps = [f"map.track={track_map}", f"map.pit={pit_map}"]
-    published = load(Config, CONFIGS / "karle2023_reference.yaml", maps)
-    clean = load(Config, CONFIGS / "karle2023.yaml", maps)
+    maps = {"map.track": track_map, "map.pit": pit_map}
+    published = Config.from_yaml(CONFIGS / "karle2023_reference.yaml").replace(maps)
+    clean = Config.from_yaml(CONFIGS / "karle2023.yaml").replace(maps)
     print(
         "| tracker | position [m] | along [m] | across [m] | yaw [rad] | speed [m/s] "
         "| LiDAR residual std along / across [m] | RADAR residual std along / across [m] "

@@ -16,9 +16,9 @@ import typer
 from matplotlib.axes import Axes
 from scipy.stats import t
 
-from fgtrack.cli.sweep import swept
-from fgtrack.core.types import FloatArray
-from fgtrack.show.figures.style import log_axis
+import fgtrack
+from fgtrack import FloatArray
+from fgtrack.show import log_axis
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/delay.yaml"
 QUICK_SEEDS = 2
@@ -141,7 +141,9 @@ def main(
     ] = False,
 ) -> None:
     """Write ratios.csv and delay.png beside sweep.csv."""
-    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
+    rows = fgtrack.sweep(SWEEP, out, num_seeds=QUICK_SEEDS if quick else None).to_dict(
+        "records"
+    )
     position, speed = errors(rows, POSITION), errors(rows, SPEED)
     rates_hz = sorted({rate_hz for _, rate_hz, _ in position})
     delays_s = sorted({delay_s for delay_s, _, _ in position})

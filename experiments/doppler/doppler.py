@@ -18,15 +18,20 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.linalg import congruence, mahalanobis_squared
-from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.filters.propagation import wrapped
-from fgtrack.evaluation.intervals import Estimate, paired
-from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
-from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    Estimator,
+    FloatArray,
+    Measurement,
+    SensorPose,
+    Start,
+    TrackState,
+    measured_position,
+    measurement_model,
+    wrap_angle,
+)
+from fgtrack.evaluation import Estimate, paired
+from fgtrack.sim import draw_states
 
 MOTION = CTRV()
 STEP_S, DURATION_S, SETTLED_S = 0.1, 5.0, 1.0
@@ -52,6 +57,18 @@ class Scene(NamedTuple):
     """One at each of these stamps."""
 
 
+def distance_squared(y: FloatArray, S: FloatArray) -> float:
+    """Squared Mahalanobis distance y' S^-1 y of a vector y (k,)."""
+    return float(y @ np.linalg.solve(S, y))
+
+
+def difference(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Difference of two states of CTRV, shape (5,), with the yaw in (-pi, pi]."""
+    result = one - other
+    result[2] = wrap_angle(result[2])
+    return result
+
+
 class Hypotheses:
     """One estimator for each of several starts, until one is left; the state is that of the likeliest.
 
@@ -75,14 +92,12 @@ class Hypotheses:
             y, H = measurement.model.linearised(
                 measurement.z, state.mean, measurement.pose
             )
-            S = congruence(H, state.covariance) + measurement.R
+            S = H @ state.covariance @ H.T + measurement.R
             result = each.update(measurement)
             if result.innovation is not None:
                 if result.innovation_covariance is not None:
                     y, S = result.innovation, result.innovation_covariance
-                density = -0.5 * float(
-                    mahalanobis_squared(y, S) + np.linalg.slogdet(S)[1]
-                )
+                density = -0.5 * float(distance_squared(y, S) + np.linalg.slogdet(S)[1])
                 fused.append((log_weight + density, each))
         ordered, self.weighted = (
             sorted(fused or self.weighted, key=lambda each: -each[0]),
@@ -95,9 +110,7 @@ class Hypotheses:
             for index, (other, better) in enumerate(self.weighted):
                 kept = better.state_at(measurement.stamp_ns)
                 if (
-                    mahalanobis_squared(
-                        wrapped(MOTION, state.mean - kept.mean), kept.covariance
-                    )
+                    distance_squared(difference(state.mean, kept.mean), kept.covariance)
                     < SAME
                 ):
                     self.weighted[index] = (

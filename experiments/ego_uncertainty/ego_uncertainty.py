@@ -23,20 +23,25 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import EgoConfig, MotionConfig
-from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import EgoState, Message
-from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.matching import match, position_nees
-from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.public import replay
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.scenario import EgoMessages, Scenario
-from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import DrawnVehicle
-from fgtrack.tracking.birth import Birth
+from fgtrack import (
+    Config,
+    EgoState,
+    Message,
+    SensorModel,
+    nanoseconds,
+    replay,
+    seconds,
+    simulate,
+)
+from fgtrack.config import Birth, EgoConfig, MotionConfig
+from fgtrack.evaluation import average, match, paired, position_nees
+from fgtrack.sim import (
+    ConstantDelay,
+    DrawnVehicle,
+    EgoMessages,
+    Scenario,
+    SimulatedSensor,
+)
 
 MODES = ("none", "independent")
 EXACT = "no error"
@@ -124,7 +129,7 @@ def erring(
 def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
     """One drive, tracked with `ego.uncertainty` of `mode`."""
     config = replace(
-        read_config("karle2023"),
+        Config.from_yaml("karle2023"),
         estimator=estimator,
         sensors={"lidar": SensorModel(std=STD)},
         motion=MOTION,
@@ -153,7 +158,7 @@ def drive(
 ) -> dict[str, Result]:
     """One recording in every mode, and with an ego that has no error."""
     rng = np.random.default_rng([seed, count])
-    exact = simulate(scenario(count, duration_s), rng)
+    exact = list(simulate(scenario(count, duration_s), seed=rng))
     messages = list(erring(exact, time_s, rng))
     return {mode: result(messages, mode, estimator) for mode in MODES} | {
         EXACT: result(exact, "none", estimator)

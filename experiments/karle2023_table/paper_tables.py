@@ -16,19 +16,24 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.runs import EvaluatedRun, evaluated
-from fgtrack.evaluation.scores.innovations import (
+from fgtrack import NS_PER_S, BoolArray, FloatArray, IntArray, Run, Tables
+from fgtrack.evaluation import (
     LOCAL_NAMES,
+    MS,
+    RUN,
+    Column,
+    Columns,
+    Distribution,
+    EvaluatedRun,
+    Moments,
+    Table,
+    ego_states,
+    evaluated,
     local_innovations,
     message_delays,
     moments_of,
+    named,
 )
-from fgtrack.evaluation.scores.statistics import Distribution, Moments
-from fgtrack.evaluation.tables import MS, RUN, Column, Table, Tables, named
-from fgtrack.evaluation.truth import ego_states
-from fgtrack.runs import Columns, Run
 
 _HEADINGS = {
     "along_m": "along\n[m]",

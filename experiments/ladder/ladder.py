@@ -30,17 +30,22 @@ import typer
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from fgtrack.core.errors import CallError
-from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
-from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CV
-from fgtrack.show.figures.paper import styled
-from fgtrack.show.figures.style import WRONG, log_axis, save
-from fgtrack.show.palette import styles
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CV,
+    CallError,
+    Estimator,
+    FloatArray,
+    Measurement,
+    Start,
+    UpdateStatus,
+    estimator,
+    estimator_claims,
+    list_estimators,
+    measurement_model,
+    nanoseconds,
+)
+from fgtrack.show import WRONG, log_axis, save, styled, styles
+from fgtrack.sim import draw_states
 
 MOTION = CV(velocity_density_m2ps3=5.0)
 POSITION = measurement_model(("x_m", "y_m"), MOTION)
@@ -64,11 +69,8 @@ PRIOR = Start(
 
 #: What each method is exact for, by name; plug-ins of the group `fgtrack.oosm` included.
 METHODS: dict[str, str] = {
-    "ekf-replay": EXACT,
-    **{
-        name: Claims.of(factory).exact
-        for name, factory in ESTIMATORS.loaded(OOSM_GROUP).items()
-    },
+    name: estimator_claims(name).exact
+    for name in ("ekf-replay", *list_estimators("fgtrack.oosm"))
 }
 
 REFERENCE_RUNS = 400

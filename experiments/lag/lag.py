@@ -16,12 +16,16 @@ import typer
 from scipy.stats import chi2
 
 import fgtrack
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    NS_PER_S,
+    Estimator,
+    FloatArray,
+    Measurement,
+    Start,
+    measurement_model,
+)
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.025

@@ -22,15 +22,9 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import comparison
-from fgtrack.evaluation.intervals import within_run
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.inputs.source import open_input
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.redelay import SensorDelays, redelay
+from fgtrack import Config, FloatArray, open_input
+from fgtrack.evaluation import EvaluatedRun, comparisons, within_run
+from fgtrack.sim import ConstantDelay, SensorDelays, redelay
 
 REFERENCE = "ekf-backward-forward"
 GROUPS = (
@@ -57,9 +51,14 @@ QUANTITY = "position_rmse_m"
 
 def settings(data: str, sensor: str) -> Config:
     """The shipped configuration, of Autoferry with the cameras where one of them is `sensor`."""
-    config = read_config(data)
+    config = Config.from_yaml(data)
     config = replace(config, evaluation=replace(config.evaluation, multi_object=False))
     return replace(config, ignore_sensors=()) if sensor in CAMERAS else config
+
+
+def sums_of(runs: list[EvaluatedRun]) -> Mapping[str, FloatArray]:
+    """Sums of the comparison of runs of one recording; none if they track nothing in common."""
+    return next((one.sums for one in comparisons(runs)), {})
 
 
 def sums(source: Path, config: Config, sensor: str, delay_s: float) -> list[FloatArray]:
@@ -79,7 +78,7 @@ def sums(source: Path, config: Config, sensor: str, delay_s: float) -> list[Floa
         )
         for name in names
     }
-    compared = [comparison([runs[name] for name in group]).sums for group in GROUPS]
+    compared = [sums_of([runs[name] for name in group]) for group in GROUPS]
     nothing = [np.zeros((0, len(group) + 1)) for group in GROUPS]
     return [
         found.get(QUANTITY, empty)

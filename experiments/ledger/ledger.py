@@ -16,11 +16,11 @@ import pandas as pd
 import typer
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.evaluation.intervals import average, paired
+from fgtrack import Config
+from fgtrack.evaluation import average, paired
 
 REFERENCE = "ekf-replay"
-MAPS = {"track_map": "oval", "pit_map": "oval"}
+MAPS = {"map.track": "oval", "map.pit": "oval"}
 NOISES = {"paper": "smoother", "tuned": "tuned"}
 """Shipped configurations, which differ in the noise."""
 
@@ -30,7 +30,7 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
     messages = list(fgtrack.simulate("default", seed=seed, duration_s=duration_s))
     rows: list[dict[str, object]] = []
     for noise, name in NOISES.items():
-        config = read_config(name, estimator="ekf-backward-forward", **MAPS)
+        config = Config.from_yaml(name).replace(MAPS, estimator="ekf-backward-forward")
         result = fgtrack.ledger(messages, config)
         tables = result.tables.tables
 

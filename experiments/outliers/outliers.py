@@ -15,14 +15,17 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.evaluation.intervals import paired
-from fgtrack.models.measurement import measurement_model
-from fgtrack.models.motion import CTRV
-from fgtrack.models.sensors import RobustLoss
-from fgtrack.sim.vehicles import draw_states
+from fgtrack import (
+    CTRV,
+    NS_PER_S,
+    FloatArray,
+    Measurement,
+    RobustLoss,
+    Start,
+    measurement_model,
+)
+from fgtrack.evaluation import paired
+from fgtrack.sim import draw_states
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.05

@@ -22,17 +22,25 @@ from joblib import Parallel, delayed
 from scores import autoferry_sources, nis_ratios, write
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.types import FloatArray, IntArray, Message
-from fgtrack.evaluation.comparison import comparison
-from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.truth import ego_states, true_paths
-from fgtrack.inputs.source import open_input
-from fgtrack.models.sensors import Correlation, Filter, SensorModel
-from fgtrack.runs import Run
+from fgtrack import (
+    Config,
+    FloatArray,
+    IntArray,
+    Message,
+    Run,
+    SensorModel,
+    open_input,
+)
+from fgtrack.config import Correlation, Filter
+from fgtrack.evaluation import (
+    UNKNOWN,
+    Estimate,
+    EvaluatedRun,
+    comparisons,
+    ego_states,
+    true_paths,
+    within_run,
+)
 
 CAMERAS = ("infrared", "daylight")
 FARTHEST_RAD = 0.15  # a bearing farther off is of something else
@@ -72,6 +80,11 @@ class Series(NamedTuple):
     """Shape (n,)."""
 
 
+def wrapped(angles_rad: FloatArray) -> FloatArray:
+    """Angles in [-pi, pi), any shape."""
+    return np.mod(angles_rad + np.pi, 2.0 * np.pi) - np.pi
+
+
 def with_cameras(config: Config, errors: str) -> Config:
     """`config` with the cameras, whose `errors` are one of `ERRORS`; `none`: received like that, but not used."""
     camera = SensorModel(std={"bearing_rad": STD_RAD}, correlation=ERRORS.get(errors))
@@ -99,8 +112,8 @@ def errors_of(run: Run, camera: str) -> list[Series]:
     true_rad = np.arctan2(places_m[..., 1], places_m[..., 0]) - poses[:, 2]
     found = []
     for place, own_rad in enumerate(true_rad):
-        error_rad = wrap_angles(seen["bearing_rad"] - own_rad)
-        others = np.abs(wrap_angles(np.delete(true_rad, place, axis=0) - own_rad))
+        error_rad = wrapped(seen["bearing_rad"] - own_rad)
+        others = np.abs(wrapped(np.delete(true_rad, place, axis=0) - own_rad))
         alone = (np.nan_to_num(others, nan=math.pi) > APART_RAD).all(axis=0)
         rows = np.flatnonzero(alone & (np.abs(error_rad) < FARTHEST_RAD))
         rows = rows[np.lexsort((np.abs(error_rad[rows]), stamps_ns[rows]))]
@@ -201,7 +214,7 @@ def bounds(one: Estimate) -> tuple[float, float, float]:
 
 def change(without: EvaluatedRun, run: EvaluatedRun, quantity: str) -> Estimate:
     """What the cameras change, less is better."""
-    ticks = comparison([without, run]).sums[quantity]
+    ticks = comparisons([without, run])[0].sums[quantity]
     return within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]))
 
 
@@ -220,7 +233,7 @@ def main(
     jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
 ) -> None:
     """Replay all scenarios without and with cameras, print both tables."""
-    config = read_config(configuration)
+    config = Config.from_yaml(configuration)
     found = Parallel(n_jobs=jobs)(
         delayed(measured)(source, config, seconds)
         for source in autoferry_sources(autoferry, scenarios).values()

@@ -5,13 +5,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, Message
-from fgtrack.evaluation.comparison import comparison
-from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.prediction import STEP_S, displacements
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.redelay import SensorDelays, redelay
+from fgtrack import FloatArray, Message
+from fgtrack.evaluation import (
+    PREDICTION_STEP_S,
+    Estimate,
+    EvaluatedRun,
+    by_stamp,
+    comparisons,
+    displacements,
+    within_run,
+)
+from fgtrack.sim import ConstantDelay, SensorDelays, redelay
 
 QUANTITIES = ("position_rmse_m", "gospa_in_view_rms_m")
 HEADER = (
@@ -44,7 +48,7 @@ def sums(
     Positions where all runs track the same object at the same stamp, now and `horizons_s` ahead; GOSPA at all ticks.
     """
     runs = [*prompt, *after]
-    found = comparison(runs).sums
+    found = comparisons(runs)[0].sums
     ahead = {
         f"position_{horizon_s:g}_s_ahead_rmse_m": _ahead(runs, horizon_s)
         for horizon_s in horizons_s
@@ -67,7 +71,9 @@ def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
         )
         for one in found
         for column in [
-            np.square(one.values["arc"][:, round(horizon_s / STEP_S) - 1]).tolist()
+            np.square(
+                one.values["arc"][:, round(horizon_s / PREDICTION_STEP_S) - 1]
+            ).tolist()
         ]
     ]
     places = sorted(functools.reduce(set.intersection, (set(each) for each in squares)))

@@ -29,11 +29,9 @@ from joblib import Parallel, delayed
 from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import ClockConfig, Config
-from fgtrack.core.types import DetectionList, Message
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.inputs.source import open_input
+from fgtrack import Config, DetectionList, Message, open_input
+from fgtrack.config import ClockConfig
+from fgtrack.evaluation import EvaluatedRun
 
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 LIDAR, CAMERA, SECOND = "pointrcnn_car", "rrc_car", "second_lidar"
@@ -127,7 +125,7 @@ def main(
     jobs: Annotated[int, typer.Option(help="Sequences at a time.")] = 1,
 ) -> None:
     """Replay all sequences with and without the delay, print costs.csv and scores.csv."""
-    config = replace(read_config(config_name), clock=ClockConfig(node_hz=NODE_HZ))
+    config = replace(Config.from_yaml(config_name), clock=ClockConfig(node_hz=NODE_HZ))
     sources, names = kitti_sources(kitti, sequences), arrangements.split(",")
     tasks = [(name, source) for name in names for source in sources.values()]
     found = Parallel(n_jobs=jobs)(

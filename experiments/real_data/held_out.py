@@ -21,11 +21,8 @@ from rules import numbers, recorded, ruled
 from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.inputs.source import open_input
+from fgtrack import Config, open_input
+from fgtrack.evaluation import EvaluatedRun, paired
 
 
 def judged(
@@ -92,7 +89,7 @@ def main(
     jobs: Annotated[int, typer.Option(help="Scenarios at a time.")] = 1,
 ) -> None:
     """Apply the rules with each scenario left out, judge it, print all tables."""
-    config = read_config(base)
+    config = Config.from_yaml(base)
     sources = autoferry_sources(autoferry, "")
     known = {name: recorded(source, config) for name, source in sources.items()}
     judge_names = judge.split(",") if judge else list(known)

@@ -23,16 +23,9 @@ from scipy.special import expit
 from scores import SEQUENCES, kitti_sources, raw, raw_mota, scans, write
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray
-from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.metrics import evaluate
-from fgtrack.inputs.source import open_input
-from fgtrack.models.sensors import Score
-from fgtrack.runs import NO_TRACK, Run
-from fgtrack.tracking.lives.existence import ExistenceRules
+from fgtrack import NS_PER_S, BoolArray, Config, FloatArray, Run, evaluate, open_input
+from fgtrack.config import ExistenceRules, Score
+from fgtrack.evaluation import NO_TRACK, match
 
 SENSOR = "pointrcnn_car"
 SCORES = (2.0, 3.0)
@@ -182,7 +175,7 @@ def main(
     jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
 ) -> None:
     """Fit to all but one, track that one; print leave_one_out.csv."""
-    config = replace(read_config("kitti"), estimator=estimator)
+    config = replace(Config.from_yaml("kitti"), estimator=estimator)
     sources = kitti_sources(kitti, sequences)
     labels = {
         name: labelled(

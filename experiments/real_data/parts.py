@@ -18,10 +18,8 @@ from joblib import Parallel, delayed
 from scores import SEQUENCES, autoferry_sources, kitti_sources
 
 import fgtrack
-from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.intervals import Statistic, within_run
-from fgtrack.evaluation.matching import Matching, match
-from fgtrack.runs import NO_TRACK
+from fgtrack import FloatArray
+from fgtrack.evaluation import NO_TRACK, Matching, Statistic, match, within_run
 
 SHIPPED = "shipped"
 #: Visible at any time, as far as a number can say so.

@@ -22,9 +22,8 @@ from scores import (
 )
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.evaluation.runs import EvaluatedRun
+from fgtrack import Config
+from fgtrack.evaluation import EvaluatedRun
 
 
 def judged(name: str, source: Path, config: Config) -> Found:
@@ -69,7 +68,7 @@ def main(
         groups.append(("kitti", kitti_config, kitti_sources(kitti, sequences)))
     for group, config, sources in groups:
         configs = [
-            replace(read_config(config), estimator=each)
+            replace(Config.from_yaml(config), estimator=each)
             for each in estimators.split(",")
         ]
         tasks = [(*source, one) for one in configs for source in sources.items()]

@@ -7,15 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 from scores import scans
 
-from fgtrack.config.settings import NOISE_HZ, Config
-from fgtrack.core.time import seconds
-from fgtrack.core.types import FloatArray, TruthState
-from fgtrack.inputs.source import open_input
-from fgtrack.models.sensors import Correlation
-from fgtrack.tracking.association import GatedMahalanobis, chi_square_quantile
-from fgtrack.tracking.lives.existence import ExistenceRules
+from fgtrack import Config, FloatArray, TruthState, open_input, seconds
+from fgtrack.config import NOISE_HZ, Correlation, ExistenceRules, GatedMahalanobis
 
 #: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
 #: the hull, which the robust loss is for.
@@ -118,7 +114,7 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     assert isinstance(config.association, GatedMahalanobis)
     sensors, gate = (
         dict(config.sensors),
-        chi_square_quantile(config.association.gate_probability, 2),
+        float(chi2.ppf(config.association.gate_probability, 2)),
     )
     for name in SENSORS:
         vessels = [vessel for one in recordings for vessel in one.seen[name]]

@@ -8,14 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.config.settings import Config
-from fgtrack.core.geometry import rotation
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
-from fgtrack.evaluation.matching import match, scenes
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.multi_object import clear
-from fgtrack.inputs.source import open_input
-from fgtrack.runs import Columns, Run
+from fgtrack import (
+    Config,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    Message,
+    Run,
+    TrackStatus,
+    open_input,
+    rotation,
+)
+from fgtrack.evaluation import Columns, EvaluatedRun, clear, match, scenes
 
 SEQUENCES = "0004,0006,0008,0010,0018"
 """Of the KITTI tracking data set."""

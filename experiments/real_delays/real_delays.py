@@ -21,18 +21,17 @@ import typer
 from scipy.optimize import linear_sum_assignment
 
 import fgtrack
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
-from fgtrack.core.types import (
+from fgtrack import (
+    Config,
     Detection,
     DetectionList,
     FloatArray,
     Message,
     TrackStatus,
+    open_input,
 )
-from fgtrack.evaluation.intervals import paired
+from fgtrack.evaluation import paired
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.replay import delivered
 
@@ -136,7 +135,7 @@ class Judge:
 
 
 def read(recording: Recording, data: Path) -> tuple[list[Message], Config]:
-    config = read_config(recording.config, dict(recording.settings))
+    config = Config.from_yaml(recording.config).replace(recording.settings)
     messages: list[Message] = []
     for message in UntilBreak(
         open_input(data / recording.path, config.input).messages()
@@ -287,7 +286,7 @@ def horizon(data: Path) -> Iterator[dict[str, object]]:
     """Windows of a filter for a car whose reports come in bursts."""
     recording = Recording(CAR, "v2x", 0.5)
     for horizon_s in HORIZONS_S:
-        config = read_config("v2x", {"filter.storage_s": horizon_s})
+        config = Config.from_yaml("v2x").replace({"filter.storage_s": horizon_s})
         run = fgtrack.replay(data / CAR, config)
         counts = dict(
             zip(
@@ -467,7 +466,7 @@ def simulated(seed: int) -> Iterator[dict[str, object]]:
                 **({} if robust else {"sensors.adsb.loss": None}),
                 "sensors.adsb.std": {"x_m": 10.0, "y_m": 10.0},
             }
-            run = fgtrack.replay(messages, read_config("adsb", settings))
+            run = fgtrack.replay(messages, Config.from_yaml("adsb").replace(settings))
             now_s = run.tables["tracks"]["now_ns"] / S
             own = (now_s > 30.0) & (now_s < 390.0)
             at = np.stack(

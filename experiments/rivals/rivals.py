@@ -19,12 +19,8 @@ import numpy as np
 import typer
 
 import fgtrack
-from fgtrack.config.reading import read_scenario
-from fgtrack.core.types import Detection, DetectionList, Message
-from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.models.oval import OVAL
-from fgtrack.models.track_map import COLUMNS
+from fgtrack import Detection, DetectionList, Message, read_scenario
+from fgtrack.evaluation import EvaluatedRun, average, paired
 
 Settings = Mapping[str, Any]  # Any: values of a configuration
 
@@ -177,9 +173,9 @@ def in_points(messages: Iterable[Message], sensor: str) -> Iterable[Message]:
 def straightened(share: float, folder: Path) -> str:
     """The built-in track, as a map that says too little of the curvature, or by its name."""
     if not share:
-        return OVAL
+        return "oval"
     table = np.loadtxt("configs/maps/oval_track.csv", delimiter=";")
-    table[:, COLUMNS.index("kappa_ref_radpm")] *= 1.0 - share
+    table[:, -2] *= 1.0 - share
     np.savetxt(folder / "map.csv", table, delimiter=";")
     return str(folder / "map.csv")
 

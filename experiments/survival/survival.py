@@ -16,16 +16,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import ClockConfig
-from fgtrack.core.types import FloatArray
-from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.runs import Run
-from fgtrack.sim.delays import ConstantDelay
-from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
+from fgtrack import Config, FloatArray, Run, replay, simulate
+from fgtrack.config import ClockConfig
+from fgtrack.sim import ConstantDelay, Scenario, SimulatedSensor, TrackVehicle
 
 RADAR_DELAY_S = 0.062
 LIDAR_DELAYS_S = (0.062, 0.08, 0.1, 0.12, 0.151, 0.2)
@@ -89,7 +82,7 @@ def main(
 ) -> None:
     """Run the tracker over all delays and rates, write survival.csv and survival.png."""
     out.mkdir(parents=True, exist_ok=True)
-    config = read_config("karle2023")
+    config = Config.from_yaml("karle2023")
     config = replace(
         config,
         map=replace(config.map, track="oval", pit="oval"),
@@ -98,10 +91,8 @@ def main(
     rows = []
     for rate_hz in LIDAR_RATES_HZ:
         for delay_s in LIDAR_DELAYS_S:
-            messages = simulate(
-                scenario(delay_s, rate_hz, duration_s), np.random.default_rng(seed)
-            )
-            measured = wiped_share(replay_in_memory(messages, config))
+            messages = simulate(scenario(delay_s, rate_hz, duration_s), seed=seed)
+            measured = wiped_share(replay(messages, config))
             rows.append(
                 (rate_hz, delay_s, measured, float(expected_share(delay_s, rate_hz)))
             )

@@ -15,10 +15,9 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 
-from fgtrack.cli.sweep import swept
-from fgtrack.core.types import FloatArray
-from fgtrack.show.figures.style import log_axis
-from fgtrack.show.palette import PALETTE
+import fgtrack
+from fgtrack import FloatArray
+from fgtrack.show import PALETTE, log_axis
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/wrong_stamps.yaml"
 QUICK_SEEDS = 2
@@ -128,7 +127,9 @@ def main(
     ] = False,
 ) -> None:
     """Write stamps.csv and stamps.png beside sweep.csv."""
-    rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
+    rows = fgtrack.sweep(SWEEP, out, num_seeds=QUICK_SEEDS if quick else None).to_dict(
+        "records"
+    )
     rmse, nis, nees = (values(rows, column) for column in (RMSE, NIS, NEES))
     labels = list(dict.fromkeys(label for label, _ in rmse))
     shown = effects(labels)

@@ -28,7 +28,7 @@ from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.inputs.source import open_input
-from fgtrack.sim.redelay import SensorDelays, redelay
+from fgtrack.sim.new_delays import SensorDelays, redelay
 from fgtrack.sim.simulate import simulate as simulated
 
 

@@ -1,11 +1,8 @@
 """`fgtrack sweep`: runs settings x seeds x estimators into one table."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import pandas as pd
 from typer import Argument, Option
 
 from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
@@ -13,7 +10,6 @@ from fgtrack.cli.show import progress, say, show
 from fgtrack.config.shipped import find_file
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_no_overlap, write_file
-from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.tables.seeds import (
     SweepTable,
     difference_table,
@@ -21,20 +17,16 @@ from fgtrack.evaluation.tables.seeds import (
     seed_comparisons,
     summary_table,
 )
+from fgtrack.pipeline.scored_sweep import score
 from fgtrack.pipeline.sweep import (
     ERROR_TABLE,
     PAIRED_TABLE,
     PRODUCTS,
     SUMMARY_TABLE,
     SWEEP_TABLE,
-    Scalar,
     Sweep,
 )
 from fgtrack.pipeline.sweep_plan import load_plan
-from fgtrack.runs import Run
-
-#: Prefix of the metrics that are wall times; they have their own table.
-_TIMES = "time_per_"
 
 
 def sweep(
@@ -95,25 +87,6 @@ def sweep(
         )
 
 
-def swept(
-    sweep_file: Path, out: Path, num_seeds: int | None = None
-) -> list[dict[str, str]]:
-    """Return the rows of the table in `out`, for scripts; if there is no table, the sweep is run first.
-
-    The first `num_seeds` seeds are run, by default all.
-    """
-    if not (out / SWEEP_TABLE).exists():
-        plan = load_plan(sweep_file)
-        jobs = tuple(
-            job for job in plan.jobs if num_seeds is None or job.seed < num_seeds
-        )
-        Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    rows: list[dict[str, str]] = pd.read_csv(
-        out / SWEEP_TABLE, dtype=str, keep_default_na=False
-    ).to_dict("records")
-    return rows
-
-
 def _summarise(
     table: SweepTable, out: Path, form: Form | None, everything: bool
 ) -> None:
@@ -128,27 +101,3 @@ def _summarise(
     show(summary.in_full() if everything else summary, form)
     if form is None and not everything:
         say(f"\nall metrics: --all, {out / SUMMARY_TABLE}, {out / PAIRED_TABLE}")
-
-
-def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
-    """Return all scalar metrics of `run` by path, and its wall times."""
-    scalars = {
-        name: value
-        for name, value in _scalars(evaluate(run).as_dict(), "")
-        if name not in ("name", "estimator")
-    }
-    times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
-    return {name: value for name, value in scalars.items() if name not in times}, times
-
-
-def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
-    """Yield path and value of every scalar; an entry of a list is named by its lag, else by its index."""
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            yield from _scalars(entry, f"{path}.{name}" if path else name)
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        for index, entry in enumerate(value):
-            name = entry.get("lag_s", index) if isinstance(entry, Mapping) else index
-            yield from _scalars(entry, f"{path}.{name}")
-    elif value is None or isinstance(value, (str, int, float)):
-        yield path, value

@@ -1,4 +1,7 @@
-"""The configuration of a run: its settings with their defaults, YAML files, and configurations that are shipped."""
+"""The configuration of a run: its sections with their defaults.
+
+The names below are public.
+"""
 
 from fgtrack.config.settings import (
     NOISE_HZ,
@@ -13,17 +16,29 @@ from fgtrack.config.settings import (
     MapConfig,
     MotionConfig,
 )
+from fgtrack.models.sensors import Correlation, Filter, Mount, Score
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.birth import Birth
+from fgtrack.tracking.lives.existence import ExistenceRules
 
 __all__ = [
-    "NOISE_HZ",
-    "SMOOTHERS",
+    "Birth",
     "ClockConfig",
     "Config",
+    "Correlation",
     "Defect",
     "Effective",
     "EgoConfig",
+    "ExistenceRules",
+    "Filter",
     "FilterConfig",
+    "GatedEuclidean",
+    "GatedMahalanobis",
     "InitiationConfig",
     "MapConfig",
     "MotionConfig",
+    "Mount",
+    "NOISE_HZ",
+    "SMOOTHERS",
+    "Score",
 ]

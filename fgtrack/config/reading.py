@@ -46,15 +46,20 @@ def read_config(
 
 
 def read_scenario(
-    name: "str | Path | Scenario",
+    name: "str | Path | Scenario | Mapping[str, object]",
     folder: Path | None = None,
     duration_s: float | None = None,
 ) -> "Scenario":
-    """The scenario of a file in `folder` or of that shipped name, as long as `duration_s`; raises as `read_config`."""
+    """Return the scenario of a file in `folder`, of a shipped name, or of a mapping with the keys of such a file.
+
+    `duration_s` replaces its length. Raises as `read_config`.
+    """
     from fgtrack.sim.scenario import Scenario
 
     if isinstance(name, Scenario):
         raw, origin = plain(name), "the given scenario"
+    elif isinstance(name, Mapping):
+        raw, origin = dict(name), "the given scenario"
     else:
         check_paths(scenario=name)
         path = find_file("scenario", name, folder)

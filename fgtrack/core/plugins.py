@@ -52,6 +52,14 @@ class Registry:
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
 
+    def names(self, group: str | None = None) -> list[str]:
+        """Names of all parts, or of the parts of one group of entry points."""
+        return [
+            name
+            for name, entry in self._entries.items()
+            if group in (None, entry.group)
+        ]
+
     def loaded(self, group: str | None = None) -> dict[str, Any]:  # Any: see `load`
         """Return all parts, or the parts of `group`, by name.
 

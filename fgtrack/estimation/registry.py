@@ -126,9 +126,18 @@ class Claims:
         )
 
 
-def list_estimators() -> list[str]:
-    """Names of all estimators, those of installed plug-ins included."""
-    return list(ESTIMATORS)
+def list_estimators(group: str | None = None) -> list[str]:
+    """Names of all estimators, those of installed plug-ins included.
+
+    `group` selects the entries of one group of entry points: `fgtrack.estimators`, or `fgtrack.oosm` with the methods
+    for late measurements.
+    """
+    return ESTIMATORS.names(group)
+
+
+def estimator_claims(name: str) -> Claims:
+    """Return what the estimator `name` promises. Raises `CallError` for an unknown name."""
+    return Claims.of(ESTIMATORS.load(name))
 
 
 # Any: options are the estimator's own.

@@ -60,7 +60,7 @@ def corrected(
         sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0
     ):
         return message
-    from fgtrack.sim.redelay import restamped
+    from fgtrack.sim.new_delays import restamped
 
     offset_ns = nanoseconds(sensor.clock_offset_s)
     if sensor.stamp_from == "receipt":

@@ -103,7 +103,7 @@ def _messages(recording: Iterable[Message]) -> Iterator[Message]:
 def simulate(
     scenario: str | Path | Scenario = "default",
     *,
-    seed: int = 0,
+    seed: int | np.random.Generator = 0,
     duration_s: float | None = None,
     out: None = None,
 ) -> Iterator[Message]: ...
@@ -113,7 +113,7 @@ def simulate(
 def simulate(
     scenario: str | Path | Scenario = "default",
     *,
-    seed: int = 0,
+    seed: int | np.random.Generator = 0,
     duration_s: float | None = None,
     out: str | Path,
     storage: Storage = "mcap",
@@ -124,7 +124,7 @@ def simulate(
 def simulate(
     scenario: str | Path | Scenario = "default",
     *,
-    seed: int = 0,
+    seed: int | np.random.Generator = 0,
     duration_s: float | None = None,
     out: str | Path | None = None,
     storage: Storage = "mcap",
@@ -139,7 +139,7 @@ def simulate(
     scenario
         Name of a shipped scenario, path of a YAML file, or a `Scenario`.
     seed
-        Seed of the random generator; the same seed gives the same bits.
+        Seed of the random generator, or a generator, which is advanced. Equal seeds give the same bits.
     duration_s
         Duration, instead of the scenario's.
     out
@@ -150,7 +150,8 @@ def simulate(
         True to replace an existing recording at `out`.
     """
     check_paths(out=out)
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
+    is_generator = isinstance(seed, np.random.Generator)
+    if not is_generator and not (isinstance(seed, (int, np.integer)) and seed >= 0):
         raise CallError(f"seed: must be a non-negative integer, is {seed!r}")
     if out is not None:
         check_recording(Path(out), overwrite)

@@ -29,7 +29,7 @@ from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
 from fgtrack.runs import Run
-from fgtrack.sim.redelay import SensorDelays, redelay
+from fgtrack.sim.new_delays import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 

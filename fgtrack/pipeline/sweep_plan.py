@@ -29,7 +29,7 @@ from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.replay import versions
-from fgtrack.sim.redelay import SensorDelays
+from fgtrack.sim.new_delays import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
 #: Value of a key: JSON values, which the dataclass with this key validates.

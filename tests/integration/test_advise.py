@@ -18,7 +18,7 @@ from fgtrack.inputs.source import open_input
 from fgtrack.inputs.stream import write_stream
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.runs import load_run
-from fgtrack.sim.redelay import restamped
+from fgtrack.sim.new_delays import restamped
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000

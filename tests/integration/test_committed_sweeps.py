@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.cli.sweep import score
+from fgtrack.pipeline.scored_sweep import score
 from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import Job, load_plan
 

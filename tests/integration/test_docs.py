@@ -30,7 +30,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay
-from fgtrack.sim.redelay import SensorDelays
+from fgtrack.sim.new_delays import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,16 +73,35 @@ def test_every_public_name_is_there_and_documented() -> None:
         _ = fgtrack.reply
 
 
-def test_type_checkers_see_the_names_that_are_loaded() -> None:
-    nodes = ast.walk(ast.parse(Path(fgtrack.__file__).read_text(encoding="utf-8")))
+LAZY = (fgtrack, fgtrack.evaluation, fgtrack.show, fgtrack.sim)
+
+
+@pytest.mark.parametrize("package", LAZY, ids=lambda package: package.__name__)
+def test_type_checkers_see_the_names_that_are_loaded(package: Any) -> None:
+    nodes = ast.walk(ast.parse(Path(package.__file__).read_text(encoding="utf-8")))
     imports = [
         node
         for node in nodes
-        if isinstance(node, ast.ImportFrom) and node.module.startswith("fgtrack")
+        if isinstance(node, ast.ImportFrom)
+        and node.module.startswith("fgtrack")
+        and node.module != "fgtrack.core.lazy"
     ]
     seen = {alias.asname: node.module for node in imports for alias in node.names}
-    assert seen == fgtrack._HOMES
-    assert sorted(seen) == fgtrack.__all__
+    assert seen == package._HOMES
+    assert sorted(seen) == package.__all__
+
+
+@pytest.mark.parametrize(
+    "package", [*LAZY[1:], fgtrack.config, fgtrack.plot, fgtrack.testing]
+)
+def test_every_name_of_a_public_module_is_the_object_and_not_a_module(
+    package: Any,
+) -> None:
+    """A name must not be that of a module of the package: importing the module would replace the object."""
+    for name in package.__all__:
+        assert not isinstance(getattr(package, name), ModuleType), name
+    with pytest.raises(AttributeError):
+        _ = package.no_such_name
 
 
 def test_a_star_import_and_the_help_show_the_public_names_alone() -> None:

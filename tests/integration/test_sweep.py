@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fgtrack
 from fgtrack.cli.main import run
-from fgtrack.cli.sweep import score, swept
 from fgtrack.config.yaml_file import load
 from fgtrack.core.errors import DataError
 from fgtrack.inputs.stream import write_stream
+from fgtrack.pipeline.scored_sweep import score
 from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.runs import Run
@@ -489,16 +490,18 @@ def test_a_changed_file_that_the_sweep_names_is_read_again(tmp_path: Path) -> No
         assert found[0][-1] != found[1][-1]
 
 
-def test_a_script_gets_the_table_that_is_there_or_runs_the_first_seeds(
+def test_a_sweep_in_python_runs_the_first_seeds_and_then_those_that_are_left(
     tmp_path: Path,
 ) -> None:
     sweep = write_sweep(
         tmp_path,
         "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 2\nvary: {association.gate_m: [5.0, 3.0]}\n",
     )
-    found = swept(sweep, tmp_path / "out", num_seeds=1)
-    assert [(row["association.gate_m"], row["seed"]) for row in found] == [
-        ("5.0", "0"),
-        ("3.0", "0"),
-    ]
-    assert swept(sweep, tmp_path / "out") == found
+    first = fgtrack.sweep(sweep, tmp_path / "out", num_seeds=1, jobs=1)
+    assert first["association.gate_m"].tolist() == [5.0, 3.0]
+    assert first["seed"].tolist() == [0, 0]
+    metric = "truth.overall.errors.position_m.rmse"
+    every = fgtrack.sweep(sweep, tmp_path / "out", jobs=1)
+    assert sorted(every["seed"]) == [0, 0, 1, 1]
+    again = every[every["seed"] == 0]
+    assert again[metric].tolist() == first[metric].tolist()

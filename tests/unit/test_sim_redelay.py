@@ -20,7 +20,7 @@ from fgtrack.sim.delays import (
     NoDelay,
     UniformDelay,
 )
-from fgtrack.sim.redelay import OTHERS, SensorDelays, redelay
+from fgtrack.sim.new_delays import OTHERS, SensorDelays, redelay
 
 MS = 1_000_000
 LATE = SensorDelays(UniformDelay(0.0, 0.4))

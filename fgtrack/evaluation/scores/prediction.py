@@ -15,7 +15,7 @@ from fgtrack.runs import Run
 
 #: Horizons of the predictions [s].
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
-STEP_S = 0.1
+PREDICTION_STEP_S = 0.1
 _PERIOD_NS = NS_PER_S // 10  # between two predictions, as in the published node
 
 
@@ -37,7 +37,7 @@ def displacements(run: Run, matching: Matching) -> TrackErrors:
 
     The predictors are `arc` and, with a map, `rail`. Predictions are made ten times a
     second for confirmed tracks with an object. The distances have the shape (n, m),
-    with a column for every `STEP_S` ahead. NaN without truth.
+    with a column for every `PREDICTION_STEP_S` ahead. NaN without truth.
     """
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks
@@ -51,8 +51,8 @@ def displacements(run: Run, matching: Matching) -> TrackErrors:
     )
     stamps_ns = tracks["stamp_ns"][chosen]
     objects = matching.object_index[chosen]
-    ahead_s: FloatArray = STEP_S * np.arange(
-        1, round(HORIZONS_S[-1] / STEP_S) + 1, dtype=np.float64
+    ahead_s: FloatArray = PREDICTION_STEP_S * np.arange(
+        1, round(HORIZONS_S[-1] / PREDICTION_STEP_S) + 1, dtype=np.float64
     )
     at_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
     every = true_states(
@@ -80,7 +80,7 @@ def prediction_errors(
     ):
         errors[name] = {}
         for horizon_s in HORIZONS_S:
-            until = distances_m[:, : round(horizon_s / STEP_S)]
+            until = distances_m[:, : round(horizon_s / PREDICTION_STEP_S)]
             until = until[np.isfinite(until).all(axis=1)]
             errors[name][f"{horizon_s:g}s"] = PredictionErrors(
                 final_m=Moments.of(until[:, -1]),

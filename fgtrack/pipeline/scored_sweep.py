@@ -1,0 +1,84 @@
+"""A sweep of settings, seeds and estimators whose runs are scored by their metrics: `fgtrack.sweep`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fgtrack.config.shipped import find_file
+from fgtrack.core.errors import DataError
+from fgtrack.core.output import check_no_overlap
+from fgtrack.evaluation.metrics import evaluate
+from fgtrack.pipeline.sweep import ERROR_TABLE, PRODUCTS, SWEEP_TABLE, Scalar, Sweep
+from fgtrack.pipeline.sweep_plan import load_plan
+from fgtrack.runs import Run
+
+if TYPE_CHECKING:  # takes half a second to import
+    from pandas import DataFrame
+
+#: Wall times among the metrics, and what follows from them; they have a table of their own.
+_TIMES = "time_per_"
+
+
+def sweep(
+    name: str | Path,
+    out: str | Path,
+    *,
+    num_seeds: int | None = None,
+    jobs: int | None = None,
+) -> "DataFrame":
+    """Return the table `sweep.csv` of a sweep: a row for each point, seed and estimator.
+
+    The sweep resumes: runs that the folder `out` has already are not repeated.
+
+    Parameters
+    ----------
+    name
+        YAML file of the sweep, or the name of a shipped one.
+    out
+        Folder of the tables.
+    num_seeds
+        Number of leading seeds to run; None for all.
+    jobs
+        Number of processes; None for one per core.
+
+    Raises `CallError` for an invalid file, and `DataError` if a run fails.
+    """
+    import pandas
+
+    plan, folder = load_plan(find_file("sweep", name)), Path(out)
+    chosen = tuple(
+        job for job in plan.jobs if num_seeds is None or job.seed < num_seeds
+    )
+    for product in PRODUCTS:
+        check_no_overlap(folder / product, plan.inputs)
+    result = Sweep.open(replace(plan, jobs=chosen), folder).run(score, jobs=jobs or -1)
+    if result.errors:
+        raise DataError(
+            f"{folder / ERROR_TABLE}: {len(result.errors)} runs failed, the first: {result.errors[0]}"
+        )
+    return pandas.read_csv(folder / SWEEP_TABLE, float_precision="round_trip")
+
+
+def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    """Return all scalars of the metrics of `run` by path, and its wall times."""
+    scalars = {
+        name: value
+        for name, value in _scalars(evaluate(run).as_dict(), "")
+        if name not in ("name", "estimator")
+    }
+    times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
+    return {name: value for name, value in scalars.items() if name not in times}, times
+
+
+def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
+    """Path and value of every scalar; entries of a list with a lag are named by it."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            yield from _scalars(entry, f"{path}.{name}" if path else name)
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        for index, entry in enumerate(value):
+            name = entry.get("lag_s", index) if isinstance(entry, Mapping) else index
+            yield from _scalars(entry, f"{path}.{name}")
+    elif value is None or isinstance(value, (str, int, float)):
+        yield path, value
