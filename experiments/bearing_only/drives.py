@@ -38,7 +38,7 @@ from fgtrack import (
     rotation,
     wrap_angle,
 )
-from fgtrack.evaluation import Matching, by_stamp, lag_metrics, match, within_run
+from fgtrack.evaluation import Matching, lag_metrics, match, sums_by_stamp, within_run
 
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 LIDAR, CAMERA = "pointrcnn_car", "rrc_car"
@@ -306,7 +306,7 @@ def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
     squares = [_squares(matching) for matching in (ekf, smoother)]
     common = sorted(squares[0].keys() & squares[1].keys())
     samples = np.array([[square[key] for square in squares] for key in common])
-    ticks = by_stamp(np.array([key[0] for key in common]), samples)
+    ticks = sums_by_stamp(np.array([key[0] for key in common]), samples)
     found = within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]))
     return f"{found:+.4f}"
 

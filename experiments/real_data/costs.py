@@ -10,9 +10,9 @@ from fgtrack.evaluation import (
     PREDICTION_STEP_S,
     Estimate,
     EvaluatedRun,
-    by_stamp,
     comparisons,
     displacements,
+    sums_by_stamp,
     within_run,
 )
 from fgtrack.sim import ConstantDelay, SensorDelays, redelay
@@ -80,7 +80,7 @@ def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
     values = np.array([[each[place] for each in squares] for place in places]).reshape(
         -1, len(runs)
     )
-    return by_stamp(
+    return sums_by_stamp(
         np.array([stamp_ns for stamp_ns, _ in places], dtype=np.int64), values
     )
 

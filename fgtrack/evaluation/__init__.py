@@ -31,7 +31,7 @@ _HOMES = {
     "Tables": "fgtrack.evaluation.tables",
     "UNKNOWN": "fgtrack.evaluation.intervals",
     "average": "fgtrack.evaluation.intervals",
-    "by_stamp": "fgtrack.evaluation.intervals",
+    "sums_by_stamp": "fgtrack.evaluation.intervals",
     "clear": "fgtrack.evaluation.scores.multi_object",
     "comparisons": "fgtrack.evaluation.comparison",
     "displacements": "fgtrack.evaluation.scores.prediction",
@@ -62,8 +62,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.intervals import Estimate as Estimate
     from fgtrack.evaluation.intervals import Statistic as Statistic
     from fgtrack.evaluation.intervals import average as average
-    from fgtrack.evaluation.intervals import by_stamp as by_stamp
     from fgtrack.evaluation.intervals import paired as paired
+    from fgtrack.evaluation.intervals import sums_by_stamp as sums_by_stamp
     from fgtrack.evaluation.intervals import within_run as within_run
     from fgtrack.evaluation.matching import Matching as Matching
     from fgtrack.evaluation.matching import Scenes as Scenes

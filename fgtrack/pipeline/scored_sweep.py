@@ -57,7 +57,7 @@ def sweep(
         raise DataError(
             f"{folder / ERROR_TABLE}: {len(result.errors)} runs failed, the first: {result.errors[0]}"
         )
-    return pandas.read_csv(folder / SWEEP_TABLE, float_precision="round_trip")
+    return pandas.read_csv(folder / SWEEP_TABLE)
 
 
 def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
