@@ -223,9 +223,7 @@ def estimator_bank(
         return bank
     _check_options(name, factory, 3, own)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and motion.is_compiled:
-        return ReplayBank(
-            motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s
-        )
+        return ReplayBank(motion, lag_s, **own)
     return ObjectBank(
         motion,
         lambda start: start_estimator(name, factory, motion, start, lag_s, options),

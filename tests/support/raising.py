@@ -139,7 +139,12 @@ def points(tracker: Tracker) -> list[Point]:
             )
         )
     if hasattr(bank, "_rows") and hasattr(bank, "_allocate"):
-        owners.append((bank, "_put_in _take_out _allocate _fused _alone"))
+        owners.append(
+            (
+                bank,
+                "_allocate _fused _fused_outside _replayed _replay_step _keep_outside",
+            )
+        )
     return [
         Point(owner, name)
         for owner, names in owners

@@ -81,10 +81,6 @@ class ReplayEkf(WindowedFilter):
         mean, covariance, _ = self._ahead(before, stamp_ns)
         return track_state(self._motion, stamp_ns, mean, covariance)
 
-    def resume(self, steps: list[Step], start_ns: int, newest_ns: int) -> None:
-        """Go on from `steps` of a window between these stamps."""
-        self.steps, self._start_ns, self._newest_ns = steps, start_ns, newest_ns
-
     def _forget_before(self, stamp_ns: int) -> None:
         # what is measured at that very stamp may still come, and belongs behind the first step
         del self.steps[

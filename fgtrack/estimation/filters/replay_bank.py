@@ -1,17 +1,23 @@
 """The replaying EKFs of all objects in arrays."""
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.linalg import equal_ones, kernels
-from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackState
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SmoothedReport,
+    TrackState,
+)
 from fgtrack.estimation.base import (
     Measurement,
     Measurements,
@@ -22,15 +28,16 @@ from fgtrack.estimation.base import (
     no_states,
     stacks,
 )
-from fgtrack.estimation.failures import EstimatorError
+from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import Prediction
-from fgtrack.estimation.filters.propagation import kinematic_states
-from fgtrack.estimation.filters.replay import ReplayEkf, Step
-from fgtrack.estimation.object_bank import ObjectBank, Outcomes, changing_nothing
-from fgtrack.models.measurement import COMPONENTS, SensorPose, measurement_model
+from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
+from fgtrack.estimation.filters.propagation import kinematic_states, wrapped
+from fgtrack.estimation.filters.track_initiation import TrackInitiation
+from fgtrack.estimation.object_bank import Outcomes, changing_nothing
+from fgtrack.estimation.rts import Link, smoothed_back
+from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import WhiteNoise
 from fgtrack.models.robust import compiled_form
-from fgtrack.models.sensors import RobustLoss
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
@@ -45,38 +52,72 @@ _FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
 CODES = 3
 
 
-class ReplayBank(ObjectBank[ReplayEkf]):
-    """`ReplayEkf` of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
+class Outside(NamedTuple):
+    """A step that compiled loops cannot take alone."""
 
-    Filters of their own remain where a direction of travel is sought, and where a window has a measurement with a
-    robust loss or of what is not an entry of the state. See `ObjectBank` and `fgtrack.estimation.kernels.replay`. The
-    motion model is one of the shipped ones.
+    measurement: Measurement | None
+    """None of the first step, which is the prior."""
+    search: TrackInitiation | None
+    """Measurements up to here, while the direction of travel is sought."""
+
+    @property
+    def is_plugin(self) -> bool:
+        """True if a plug-in models the measurement."""
+        return self.measurement is not None and not self.measurement.model.is_compiled
+
+
+_INSIDE = Outside(None, None)
+
+
+class ReplayBank:
+    """The replaying EKFs of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
+
+    A track leaves the loop, and is replayed step by step, while its window has a step at which the direction of travel
+    was sought, or a measurement that a plug-in models. See `fgtrack.estimation.kernels.replay`.
+
+    Parameters
+    ----------
+    motion
+        One of the shipped models.
+    lag_s
+        Length of the windows.
+    initiation
+        See `Initiation`.
     """
 
     def __init__(
-        self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float
+        self, motion: WhiteNoise, lag_s: float, initiation: str = DEFAULT
     ) -> None:
-        super().__init__(motion, start, lag_s)
+        self._motion, self._lag_ns = motion, nanoseconds(lag_s)
+        self._initiation = checked_initiation(initiation)
         self._kind, self._noise = motion.kind, motion.noise
+        self.present_ns = 0
+        """See `TrackBank.present_ns`."""
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
-        self._rows: dict[int, int] = {}  # of tracks in the arrays
-        self._order: IntArray | None = (
-            None  # of all tracks by birth, until one comes, goes or moves
-        )
+        self._rows: dict[int, int] = {}
+        """Row of the arrays that holds each track, by track id in order of birth."""
+        self._order: IntArray | None = None  # these rows, until a track comes or goes
+        self._outside: dict[int, dict[int, Outside]] = {}
+        """Steps that compiled loops cannot take alone, by row and slot."""
         self._free: list[int] = []
-        self._losses: dict[tuple[int, float], RobustLoss] = {}  # by kind and width
         self._arrays = list[Any]()
-        self._shape: tuple[int, ...] = (
-            0,
-            0,
-            0,
-        )  # numbers of tracks, steps and components
+        self._shape: tuple[int, ...] = 0, 0, 0  # numbers of tracks, steps, components
         self._allocate(8, 64, 4)
+
+    @property
+    def window_start_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
+        return self.present_ns - self._lag_ns
+
+    @property
+    def track_ids(self) -> tuple[int, ...]:
+        """See `TrackBank.track_ids`."""
+        return tuple(self._rows)
 
     def _allocate(self, *least: int) -> None:
         """Make arrays for at least so many tracks, steps and components with the present contents (see the kernels)."""
         present, n = self._shape[0], self._motion.dim
-        rows, slots, k = shape = tuple(map(max, self._shape, least))
+        rows, slots, k = shape = tuple(map(max, self._shape, (*least, 0, 0)))
         arrays = [
             np.tile(np.arange(slots), (rows, 1)),
             np.zeros((rows, slots, CODES + k), dtype=np.int64),
@@ -103,11 +144,6 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """See `TrackBank.advance`."""
         self.present_ns = now_ns
         self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
-        if len(self._rows) < len(self._estimators):
-            self._ask(
-                lambda _, item: item.advance(now_ns),
-                [i for i in self._estimators if i not in self._rows],
-            )
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
@@ -122,7 +158,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def states_of(self, stamp_ns: int, track_id: int) -> StatesAt:
         """Return `states_at` of one track, at a cost that does not depend on the number of the others."""
         if track_id not in self._rows:
-            return self.states_at(stamp_ns).of(track_id)
+            return no_states(self._motion.dim)
         count, _, *states = self._ahead(np.array([self._rows[track_id]]), stamp_ns)
         return StatesAt((track_id,), *states) if count else no_states(self._motion.dim)
 
@@ -155,50 +191,52 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """Return the outcomes of a stack of measurements."""
         with changing_nothing(track_ids):
             seen = one.seen_by(self._motion)
-            is_plain = _is_plain(seen)
-            is_held = [is_plain and each in self._rows for each in track_ids]
-            groups: Sequence[Sequence[int]] = [range(len(is_held))]
-            if not (is_held and all(is_held)):
-                groups = equal_ones(is_held)
+            is_outside = [
+                not seen.model.is_compiled or self._rows[each] in self._outside
+                for each in track_ids
+            ]
         outcomes = Outcomes()
-        for chosen in groups:
+        for chosen in equal_ones(is_outside):
             part, ids = seen, track_ids
             if len(chosen) < len(track_ids):
                 part, ids = (
                     replace(seen, z=seen.z[chosen], R=seen.R[chosen]),
                     [track_ids[k] for k in chosen],
                 )
-            fuse = self._fused if is_held[chosen[0]] else self._alone
-            outcomes.add(ids, partial(fuse, stamp_ns, ids, part))
+            if not is_outside[chosen[0]]:
+                outcomes.add(ids, partial(self._fused, stamp_ns, ids, part))
+                continue
+            for track_id, own in zip(ids, Measurements(part), strict=True):
+                outcomes.add([track_id], partial(self._fused_outside, track_id, own))
         return outcomes.results(track_ids)
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
-        super().birth(track_id, prior)
-        self._order = None
-        self._put_in([track_id])
+        mean, covariance = initial_state(self._motion, prior)
+        search = TrackInitiation.of(self._motion, prior, self._initiation)
+        if not self._free:
+            self._allocate(2 * self._shape[0])
+        row = self._free[-1]
+        order, labels, steps, windows, _, _ = (array[row] for array in self._arrays)
+        first = order[0]
+        windows[:] = 1, prior.stamp_ns, prior.stamp_ns
+        labels[first, :2] = prior.stamp_ns, 0
+        steps[first] = np.vstack([mean, covariance, mean, covariance, covariance])
+        self._outside.pop(row, None)
+        if search is not None:
+            self._outside[row] = {int(first): Outside(None, search)}
+        self._rows[track_id], self._order = self._free.pop(), None
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`."""
-        super().remove(track_id)
+        row = self._rows.pop(track_id)
+        self._outside.pop(row, None)
+        self._free.append(row)
         self._order = None
-        if track_id in self._rows:
-            self._free.append(self._rows.pop(track_id))
 
-    def _alone(
-        self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
-    ) -> list[UpdateResult]:
-        """Outcomes of a stack of measurements that need the filters of their objects."""
-        with changing_nothing(track_ids):
-            for track_id in track_ids:
-                self._take_out(track_id)
-        try:
-            results = super().update(stamp_ns, track_ids, Measurements(one))
-        except EstimatorError as error:
-            self._put_in(error.answers)
-            raise
-        self._put_in(track_ids)
-        return results
+    def smoothed(self) -> list[SmoothedReport]:
+        """See `TrackBank.smoothed`: none."""
+        return []
 
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
@@ -222,8 +260,6 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 np.empty(m, dtype=np.int64),
             )
             loss, width = compiled_form(one.loss, k)
-            if one.loss is not None:
-                self._losses[loss, width] = one.loss
             now = self._lag_ns, self._start_ns, stamp_ns
             view = np.array([*one.pose, width])
             fuse = partial(
@@ -272,42 +308,11 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     ) -> tuple[BoolArray | None, FloatArray, FloatArray]:
         """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
         if self._order is None:
-            self._order = np.array(
-                [self._rows.get(i, -1) for i in self._estimators], dtype=np.int64
-            )
+            self._order = np.array([*self._rows.values()], dtype=np.int64)
         count, known, means, covariances = self._ahead(
             self._order, stamp_ns, is_present
         )
-        if len(self._rows) < len(known):
-            apart = [
-                track_id for track_id in self._estimators if track_id not in self._rows
-            ]
-            states = self._ask(
-                lambda _, item: self._state_of(item, stamp_ns, is_present), apart
-            )
-            for k, track_id in enumerate(self._estimators):
-                state = states.get(track_id)
-                if state is not None:
-                    known[k], means[k], covariances[k] = (
-                        True,
-                        state.mean,
-                        state.covariance,
-                    )
-                    count += 1
-                elif track_id in states:
-                    known[k] = False
         return None if count == len(known) else known, means, covariances
-
-    def _state_of(
-        self, item: ReplayEkf, stamp_ns: int, is_present: bool
-    ) -> TrackState | None:
-        """Return the state of a filter; at the present its first one instead of none."""
-        start_ns = item.window_ns[0]
-        return (
-            self._state(item, max(stamp_ns, start_ns))
-            if is_present or start_ns <= stamp_ns
-            else None
-        )
 
     def _ahead(
         self, rows: IntArray, stamp_ns: int, is_present: bool = False
@@ -325,85 +330,172 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         )
         return count, known, means, covariances
 
-    def _put_in(self, track_ids: Iterable[int]) -> None:
-        """Move the steps of filters into the arrays, where these can hold them; without memory they stay filters."""
-        with suppress(MemoryError):
-            for track_id in track_ids:
-                item = self._estimators[track_id]
-                if all(
-                    each.search is None and _is_plain(each.measurement)
-                    for each in item.steps
-                ):
-                    self._put(track_id, item)
+    # --- tracks outside the compiled loop, step by step
 
-    def _put(self, track_id: int, item: ReplayEkf) -> None:
-        """Move the steps of a filter into the arrays."""
-        k = max(
-            (
-                len(each.measurement.z)
-                for each in item.steps
-                if each.measurement is not None
-            ),
-            default=0,
-        )
-        rows, slots, largest = self._shape
-        if not self._free or len(item.steps) >= slots or k > largest:
-            self._allocate(rows * (1 + (not self._free)), 2 * len(item.steps), k)
-        row = self._free[-1]
-        order, labels, steps, windows, measured, views = (
-            array[row] for array in self._arrays
-        )
-        windows[:] = len(item.steps), *item.window_ns
-        for slot, each in zip(order, item.steps, strict=False):
-            steps[slot] = np.vstack([each.mean, each.covariance, *each.predicted])
-            labels[slot, :2] = each.stamp_ns, 0
-            if each.measurement is not None:
-                own, d = each.measurement, len(each.measurement.z)
-                loss, width = compiled_form(own.loss, d)
-                if own.loss is not None:
-                    self._losses[loss, width] = own.loss
-                labels[slot, 1 : d + CODES] = d, loss, *own.model.codes
-                views[slot] = *own.pose, width
-                measured[slot, 0, :d], measured[slot, 1 : d + 1, :d] = own.z, own.R
-        self._rows[track_id], self._order = self._free.pop(), None
+    def _fused_outside(self, track_id: int, one: Measurement) -> list[UpdateResult]:
+        """Return the outcome of a measurement of a track that is replayed step by step.
 
-    def _take_out(self, track_id: int) -> None:
-        """Move the steps of a filter out of the arrays, if they are there."""
-        row, n = self._rows.get(track_id), self._motion.dim
-        if row is None:
-            return
-        order, labels, steps, windows, measured, views = (
-            array[row] for array in self._arrays
+        An exception changes nothing.
+        """
+        with changing_nothing([track_id]):
+            row, k = self._rows[track_id], len(one.z)
+            if k > self._shape[2]:
+                self._allocate(0, 0, k)
+            kept = [array[row].copy() for array in self._arrays]
+            steps, is_fused = dict(self._outside.get(row, {})), False
+            try:
+                result = self._replayed(row, one, steps)
+                if result is not None and result.status in _FUSED:
+                    self._keep_outside(row, steps)
+                    is_fused = True
+            except np.linalg.LinAlgError:
+                result = UpdateResult(UpdateStatus.FAILED)
+            finally:
+                if not is_fused:
+                    for array, own in zip(self._arrays, kept, strict=True):
+                        array[row] = own
+            if result is None:
+                self._allocate(0, 2 * self._shape[1])
+        return [result] if result else self._fused_outside(track_id, one)
+
+    def _replayed(
+        self, row: int, one: Measurement, steps: dict[int, Outside]
+    ) -> UpdateResult | None:
+        """Put a measurement into the steps of a track, and re-filter the later ones; None where all slots are in use.
+
+        `steps` are those of `_outside`. Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
+        """
+        loss, width = compiled_form(one.loss, len(one.z))
+        order, _, _, windows, _, _ = self._arrays
+        index = self._call(
+            "insert",
+            row,
+            self._start_ns,
+            one.stamp_ns,
+            one.model.codes,
+            np.array([*one.pose, width]),
+            loss,
+            np.ascontiguousarray(one.z, dtype=np.float64),
+            np.ascontiguousarray(one.R, dtype=np.float64),
+            with_measured=True,
         )
-        chain = list[Step]()
-        for slot in order[: windows[0]].tolist():
-            own, (stamp_ns, d, loss, *codes), measurement = (
-                steps[slot].copy(),
-                labels[slot].tolist(),
-                None,
+        if index < 0:
+            return None if -index == _NO_ROOM else UpdateResult(_STATUS[-index])
+        last = int(windows[row, 0])
+        steps[int(order[row, index])] = Outside(one, None)
+        self._replay_step(row, index, steps)
+        y, S, nis = self._expected(row, index, last, one, steps)
+        for later in range(index + 1, last + 1):
+            self._replay_step(row, later, steps)
+        is_newest = one.stamp_ns >= windows[row, 2]
+        newest_ns = max(int(windows[row, 2]), one.stamp_ns)
+        start_ns = max(int(windows[row, 1]), newest_ns - self._lag_ns)
+        windows[row] = last + 1, start_ns, newest_ns
+        status = UpdateStatus.IN_SEQUENCE if is_newest else UpdateStatus.OUT_OF_SEQUENCE
+        return UpdateResult(status, y, nis, S)
+
+    def _call(
+        self, name: str, row: int, *arguments: Any, with_measured: bool = False
+    ) -> Any:
+        """Call a loop of `fgtrack.estimation.kernels.replay` for one track."""
+        arrays = self._arrays if with_measured else self._arrays[:4]
+        loop: Callable[..., Any] = getattr(kernels(_KERNELS), name)
+        return loop(self._kind, self._noise, *arrays, np.array([row]), *arguments)
+
+    def _replay_step(self, row: int, index: int, steps: dict[int, Outside]) -> None:
+        """Predict a step and fuse its measurement; while the direction is sought, the state is that along the line.
+        Raises `numpy.linalg.LinAlgError` where that is impossible.
+        """
+        n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
+        before, slot = order[row, index - 1 : index + 1].tolist()
+        step, k = steps.get(slot, _INSIDE), int(labels[row, slot, 1])
+        y, H = np.empty(k), np.empty((k, n))
+        self._call("predict_step", row, index)
+        if step.measurement is not None and step.is_plugin:
+            y, H = (
+                np.array(each, dtype=np.float64, order="C")
+                for each in step.measurement.model.linearised(
+                    step.measurement.z, states[row, slot, 0], step.measurement.pose
+                )
             )
-            if d:
-                names = tuple(COMPONENTS[code] for code in codes[:d])
-                *pose, width = views[slot].tolist()
-                z, R = (
-                    measured[slot, 0, :d].copy(),
-                    measured[slot, 1 : d + 1, :d].copy(),
-                )
-                measurement = Measurement(
-                    stamp_ns,
-                    measurement_model(names, self._motion),
-                    z,
-                    R,
-                    SensorPose(*pose),
-                    self._losses.get((loss, width)),
-                )
+        if not self._call(
+            "correct_step", row, index, step.is_plugin, y, H, with_measured=True
+        ):
+            raise np.linalg.LinAlgError("a measurement cannot be fused")
+        search = steps.get(before, _INSIDE).search
+        if step.measurement is None:
+            return
+        if search is not None:
+            search = search.with_measurement(step.measurement)
+        if search is not None and search.line is not None:
+            mean, states[row, slot, 1 : n + 1] = search.state()
+            states[row, slot, 0] = wrapped(self._motion, mean)
+        steps[slot] = Outside(step.measurement, search)
+
+    def _expected(
+        self,
+        row: int,
+        index: int,
+        last: int,
+        one: Measurement,
+        steps: dict[int, Outside],
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Innovation y (k,), its covariance S (k, k) and NIS of the new step at `index`, given all other steps.
+        Raises `numpy.linalg.LinAlgError` where S has no root.
+        """
+        n = self._motion.dim
+        now = self._retrodicted_along_line(row, index, last, one.stamp_ns, steps)
+        if now is None:
+            now = np.empty((n + 1, n))
+            if not self._call("retrodict", row, index, last, now):
+                raise np.linalg.LinAlgError("a prediction has no root")
+        y, H = one.model.linearised(one.z, now[0], one.pose)
+        S, nis, _ = kernels("fgtrack.estimation.kernels.kalman").innovations(
+            np.array(y, ndmin=2),
+            np.array(H, dtype=np.float64, order="C", ndmin=3),
+            now[None, 1:],
+            np.array([0]),
+            np.array(one.R, dtype=np.float64, order="C", ndmin=3),
+            one.measured,
+        )
+        if np.isnan(nis[0]):
+            raise np.linalg.LinAlgError("innovation covariance not positive definite")
+        return y, S[0], float(nis[0])
+
+    def _retrodicted_along_line(
+        self,
+        row: int,
+        index: int,
+        last: int,
+        stamp_ns: int,
+        steps: dict[int, Outside],
+    ) -> FloatArray | None:
+        """State at a stamp given all later steps, (n + 1, n), where one of these was found along a line; else None."""
+        n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
+        links = list[Link]()
+        for slot in reversed(order[row, index + 1 : last + 1].tolist()):
+            own = states[row, slot]
             predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
-            chain.append(Step(stamp_ns, measurement, own[0], own[1 : n + 1], predicted))
-        item = self._estimators[track_id]
-        item.resume(chain, *windows[1:].tolist())
-        item.advance(self._start_ns + self._lag_ns)
-        self._free.append(self._rows.pop(track_id))
-        self._order = None
+            stamp_of_slot_ns = int(labels[row, slot, 0])
+            links.insert(0, (stamp_of_slot_ns, own[0], own[1 : n + 1], predicted))
+            search = steps.get(slot, _INSIDE).search
+            if search is not None and search.line is not None:
+                _, mean, covariance, _ = links[-1]
+                mean, covariance = smoothed_back(self._motion, links, mean, covariance)
+                return np.vstack(search.retrodicted(stamp_ns, mean, covariance))
+        return None
+
+    def _keep_outside(self, row: int, steps: dict[int, Outside]) -> None:
+        """Keep `steps` of a track as far as its window needs them; without any, the compiled loop replays the track."""
+        order, labels, _, windows, _, _ = self._arrays
+        slots = order[row, : windows[row, 0]]
+        oldest_ns = max(int(windows[row, 1]), self._start_ns)
+        first = max(int(labels[row, slots, 0].searchsorted(oldest_ns)) - 1, 0)
+        kept = {slot: steps[slot] for slot in slots[first:].tolist() if slot in steps}
+        if any(each.search is not None or each.is_plugin for each in kept.values()):
+            self._outside[row] = kept
+        else:
+            self._outside.pop(row, None)
 
 
 def _results(
@@ -418,8 +510,3 @@ def _results(
             for each in results
         ]
     return results
-
-
-def _is_plain(measurement: Measurement | None) -> bool:
-    """True for None, and for a measurement whose model compiled loops contain."""
-    return measurement is None or measurement.model.is_compiled

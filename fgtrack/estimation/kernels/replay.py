@@ -135,22 +135,16 @@ def _retrodict(
 
 
 @merged
-def _step(
+def _predict(
     motion: int,
     noise: FloatArray,
     before: FloatArray,
     after: FloatArray,
     late_ns: int,
-    label: IntArray,
-    measured: FloatArray,
-    view: FloatArray,
     F: FloatArray,
-    y: FloatArray,
-    H: FloatArray,
-    space: CorrectionSpace,
-) -> bool:
-    """Predict the step `after` from the step `before`, and fuse its measurement; False where it cannot be fused."""
-    k, n = label[SIZE], before.shape[1]
+) -> None:
+    """Predict the step `after` from the step `before`."""
+    n = before.shape[1]
     predicted = after[n + 1 :]
     _ahead(
         motion,
@@ -163,7 +157,21 @@ def _step(
         predicted[n + 1 :],
     )
     copy(predicted, after[: n + 1])
-    _innovation(motion, after[0], label, measured, view, y[:k], H[:k])
+
+
+@merged
+def _correct(
+    motion: int,
+    after: FloatArray,
+    label: IntArray,
+    measured: FloatArray,
+    view: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    space: CorrectionSpace,
+) -> bool:
+    """Fuse the innovation y (k,), with its Jacobian H (k, n), into a predicted step; False where it cannot be fused."""
+    k, n = label[SIZE], after.shape[1]
     weight = correct_state(
         after[0],
         after[1 : n + 1],
@@ -253,6 +261,59 @@ def _check(
             check_rows(order[tracks[i]], 0, slots)
 
 
+@inlined
+def _check_measured(
+    order: IntArray,
+    labels: IntArray,
+    measured: FloatArray,
+    views: FloatArray,
+    k: int,
+) -> None:
+    """Raise `IndexError` unless the arrays of measurements have a place of k components for each step."""
+    check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1])
+    check(views.shape[0] == order.shape[0] and views.shape[1] == order.shape[1])
+    check(measured.shape[2] > k and measured.shape[3] >= k)
+    check(labels.shape[2] >= k + CODES and views.shape[2] > WIDTH)
+
+
+@merged
+def _insert(
+    slots: IntArray,
+    labels: IntArray,
+    measured: FloatArray,
+    views: FloatArray,
+    count: int,
+    stamp_ns: int,
+    components: IntArray,
+    view: FloatArray,
+    loss: int,
+    z: FloatArray,
+    R: FloatArray,
+) -> int:
+    """Write a measurement into the first free slot of a track, and put the slot in its place; return the index."""
+    index, own, k = count, slots[count], len(components)
+    label, new = labels[own], measured[own]
+    label[STAMP_NS], label[SIZE], label[LOSS] = stamp_ns, k, loss
+    for a in range(WIDTH + 1):
+        views[own, a] = view[a]
+    for a in range(k):
+        label[CODES + a], new[0, a] = components[a], z[a]
+        for b in range(k):
+            new[1 + a, b] = R[a, b]
+    while index > 1 and _comes_after(
+        labels[slots[index - 1]],
+        measured[slots[index - 1]],
+        views[slots[index - 1]],
+        label,
+        new,
+        views[own],
+    ):
+        slots[index] = slots[index - 1]
+        index -= 1
+    slots[index] = own
+    return index
+
+
 @njit(
     f"int64({_STEPS}, float64[:, :, :, ::1], float64[:, :, ::1], int64[::1], int64, int64, int64, int64[::1], "
     "float64[::1], int64, float64[:, ::1], float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, :, ::1], "
@@ -291,24 +352,8 @@ def fuse(
     m, k, n, num_without_room = len(tracks), y.shape[1], steps.shape[3], 0
     check_noise(motion, noise, n)
     _check(tracks, 0, order, labels, steps, windows, n)
-    check(
-        measured.shape[0] == order.shape[0]
-        and measured.shape[1] == order.shape[1]
-        and measured.shape[2] > k
-    )
-    check(
-        views.shape[0] == order.shape[0]
-        and views.shape[1] == order.shape[1]
-        and views.shape[2] > WIDTH
-        and len(view) > WIDTH
-    )
-    check(
-        k > 0
-        and measured.shape[3] >= k
-        and labels.shape[2] >= k + CODES
-        and len(components) == k
-        and z.shape[1] >= k
-    )
+    _check_measured(order, labels, measured, views, k)
+    check(k > 0 and len(components) == k and z.shape[1] >= k and len(view) > WIDTH)
     check(
         len(y) == m
         and len(z) == m
@@ -348,40 +393,42 @@ def fuse(
         if window[0] == len(slots):
             status[i], num_without_room = NO_ROOM, num_without_room + 1
             continue
-        index = count = window[0]
+        count = window[0]
         own = slots[count]
+        index = _insert(
+            slots,
+            labels[t],
+            measured[t],
+            views[t],
+            count,
+            stamp_ns,
+            components,
+            view,
+            loss,
+            z[i],
+            R[i],
+        )
         label, new = labels[t, own], measured[t, own]
-        label[STAMP_NS], label[SIZE], label[LOSS] = stamp_ns, k, loss
-        for a in range(WIDTH + 1):
-            views[t, own, a] = view[a]
-        for a in range(k):
-            label[CODES + a], new[0, a] = components[a], z[i, a]
-            for b in range(k):
-                new[1 + a, b] = R[i, a, b]
-        while index > 1 and _comes_after(
-            labels[t, slots[index - 1]],
-            measured[t, slots[index - 1]],
-            views[t, slots[index - 1]],
-            label,
-            new,
-            views[t, own],
-        ):
-            slots[index] = slots[index - 1]
-            index -= 1
-        slots[index] = own
         j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]
-            ok = _step(
+            late_ns = labels[t, s, STAMP_NS] - labels[t, left, STAMP_NS]
+            _predict(motion, noise, steps[t, left], steps[t, s], late_ns, F)
+            _innovation(
                 motion,
-                noise,
-                steps[t, left],
-                steps[t, s],
-                labels[t, s, STAMP_NS] - labels[t, left, STAMP_NS],
+                steps[t, s, 0],
                 labels[t, s],
                 measured[t, s],
                 views[t, s],
-                F,
+                innovation,
+                H,
+            )
+            ok = _correct(
+                motion,
+                steps[t, s],
+                labels[t, s],
+                measured[t, s],
+                views[t, s],
                 innovation,
                 H,
                 correction,
@@ -417,6 +464,169 @@ def fuse(
             window[0], window[2] = count + 1, max(window[2], stamp_ns)
             window[1] = max(window[1], window[2] - lag_ns)
     return num_without_room
+
+
+@njit(
+    f"int64({_STEPS}, float64[:, :, :, ::1], float64[:, :, ::1], int64[::1], int64, int64, int64[::1], float64[::1], "
+    "int64, float64[::1], float64[:, ::1])"
+)
+def insert(
+    motion: int,
+    noise: FloatArray,
+    order: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    windows: IntArray,
+    measured: FloatArray,
+    views: FloatArray,
+    tracks: IntArray,
+    oldest_ns: int,
+    stamp_ns: int,
+    components: IntArray,
+    view: FloatArray,
+    loss: int,
+    z: FloatArray,
+    R: FloatArray,
+) -> int:
+    """Put a measurement into the steps of the first of `tracks`; return its index, else minus the status.
+
+    With `predict_step`, `correct_step` and `retrodict` this is `fuse` in parts, for one track, between which a plug-in
+    linearises its measurement or an initiation replaces the state.
+    """
+    n, k = steps.shape[3], len(components)
+    check_noise(motion, noise, n)
+    _check(tracks, 0, order, labels, steps, windows, n)
+    _check_measured(order, labels, measured, views, k)
+    check_components(components, n)
+    check(k > 0 and len(view) > WIDTH and len(z) == k)
+    check(len(tracks) > 0 and R.shape == (k, k))
+    t = tracks[0]
+    slots, window = order[t], windows[t]
+    if stamp_ns < max(window[1], oldest_ns):
+        return -TOO_OLD
+    if window[0] + 1 >= len(slots):
+        _forget(max(window[1], oldest_ns), slots, labels[t], window)
+    if window[0] == len(slots):
+        return -NO_ROOM
+    return _insert(
+        slots,
+        labels[t],
+        measured[t],
+        views[t],
+        window[0],
+        stamp_ns,
+        components,
+        view,
+        loss,
+        z,
+        R,
+    )
+
+
+@njit(f"void({_STEPS}, int64[::1], int64)")
+def predict_step(
+    motion: int,
+    noise: FloatArray,
+    order: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    windows: IntArray,
+    tracks: IntArray,
+    index: int,
+) -> None:
+    """Predict the step at `index` of the first of `tracks` from the step before it."""
+    n = steps.shape[3]
+    check_noise(motion, noise, n)
+    _check(tracks, 0, order, labels, steps, windows, n)
+    check(len(tracks) > 0 and 0 < index < order.shape[1])
+    F, t = scratch(n, n), tracks[0]
+    s, left = order[t, index], order[t, index - 1]
+    late_ns = labels[t, s, STAMP_NS] - labels[t, left, STAMP_NS]
+    _predict(motion, noise, steps[t, left], steps[t, s], late_ns, F)
+
+
+@njit(
+    f"b1({_STEPS}, float64[:, :, :, ::1], float64[:, :, ::1], int64[::1], int64, b1, float64[::1], {MATRIX})"
+)
+def correct_step(
+    motion: int,
+    noise: FloatArray,
+    order: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    windows: IntArray,
+    measured: FloatArray,
+    views: FloatArray,
+    tracks: IntArray,
+    index: int,
+    is_linearised: bool,
+    y: FloatArray,
+    H: FloatArray,
+) -> bool:
+    """Fuse the measurement of the predicted step at `index` of the first of `tracks`; False where it cannot be fused.
+
+    Innovation y (k,) and Jacobian H (k, n) are given where it `is_linearised`, else they are written.
+    """
+    n, most = steps.shape[3], measured.shape[3]
+    check_noise(motion, noise, n)
+    _check(tracks, 0, order, labels, steps, windows, n)
+    check(len(tracks) > 0 and 0 < index < order.shape[1])
+    t = tracks[0]
+    s = order[t, index]
+    k = labels[t, s, SIZE]
+    _check_measured(order, labels, measured, views, k)
+    check(k > 0 and len(y) == k and H.shape == (k, n))
+    A, AP, K, KR = scratch(n, n), scratch(n, n), scratch(most, n), scratch(n, most)
+    root, spread, own_noise, column = (
+        scratch(most, most),
+        scratch(most, most),
+        scratch(most, most),
+        scratch(most, 1),
+    )
+    correction = A, AP, K, KR, root, spread, own_noise, column
+    label, own, view = labels[t, s], measured[t, s], views[t, s]
+    if not is_linearised:
+        _innovation(motion, steps[t, s, 0], label, own, view, y, H)
+    return _correct(motion, steps[t, s], label, own, view, y, H, correction)
+
+
+@njit(f"b1({_STEPS}, int64[::1], int64, int64, {MATRIX})")
+def retrodict(
+    motion: int,
+    noise: FloatArray,
+    order: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    windows: IntArray,
+    tracks: IntArray,
+    index: int,
+    last: int,
+    now: FloatArray,
+) -> bool:
+    """Write the state at the new step at `index`, without its measurement, given all steps up to `last`, (n + 1, n)."""
+    n = steps.shape[3]
+    check_noise(motion, noise, n)
+    _check(tracks, 0, order, labels, steps, windows, n)
+    check(len(tracks) > 0 and 0 < index <= last < order.shape[1])
+    check(now.shape == (n + 1, n))
+    F, root, CD, ahead, mean = (
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n, n),
+        scratch(2 * n + 1, n),
+        scratch(n),
+    )
+    t = tracks[0]
+    copy(steps[t, order[t, last], n + 1 if index == last else 0 :], now)
+    return _retrodict(
+        motion,
+        noise,
+        order[t, index : last + 1],
+        labels[t],
+        steps[t],
+        (F, root, CD, ahead, mean),
+        now,
+    )
 
 
 @njit(
