@@ -119,8 +119,9 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
 
 
 def inlined(function: _Function) -> _Function:
-    """Decorate a function that only compiled functions call: it is optimised as a part of each caller."""
+    """Decorate a function that only compiled functions call: it becomes a part of the machine code of each caller."""
     options = {
+        "forceinline": True,
         **_OPTIONS,
         **WITHOUT_COUNTING,
         "no_cpython_wrapper": True,

@@ -39,26 +39,36 @@ MAX_PARTS = 10_000
 _NUM_NODES = 5
 
 
-def _integrals(nodes: FloatArray, weights: FloatArray) -> FloatArray:
-    """Matrix that gives integrals from 0 to each node, and to 1, of the polynomial through values at the nodes.
+def _integrals(nodes: FloatArray) -> FloatArray:
+    """Matrix that gives integrals from -1/2 to each node, and to 1/2, of the polynomial through values at the nodes.
 
-    Shape (nodes + 1, nodes). The nodes lie in [0, 1].
+    Shape (nodes + 1, nodes). The nodes lie in [-1/2, 1/2].
     """
     powers = np.arange(len(nodes))
-    values = nodes[:, None] ** powers
-    integrals = nodes[:, None] ** (powers + 1) / (powers + 1)
-    return np.vstack([np.linalg.solve(values.T, integrals.T).T, weights])
+    ends = np.append(nodes, 0.5)[:, None]
+    integrals = (ends ** (powers + 1) - (-0.5) ** (powers + 1)) / (powers + 1)
+    return np.asarray(np.linalg.solve((nodes[:, None] ** powers).T, integrals.T).T)
 
 
-# Gauss-Legendre quadrature on [0, 1]; integrals up to its nodes by collocation (Hairer, Norsett and Wanner, Solving
-# Ordinary Differential Equations I, section II.7).
+# Gauss-Legendre quadrature on [-1/2, 1/2]; integrals up to its nodes by collocation (Hairer, Norsett and Wanner,
+# Solving Ordinary Differential Equations I, section II.7). The middle node is 0.
 _roots, _root_weights = np.polynomial.legendre.leggauss(_NUM_NODES)
-_NODES, _WEIGHTS = 0.5 * (_roots + 1.0), 0.5 * _root_weights
-_INTEGRALS = _integrals(_NODES, _WEIGHTS)
-# Factors 1/1!, 1/2!, ... of the series of (exp(b r) - 1) / b, and alternating ones of those of sine and cosine.
-_GROWTH = 1.0 / np.cumprod(np.arange(1.0, 11.0))
-_COS = np.array([(-1.0) ** k / math.factorial(2 * k) for k in range(7)])
-_SIN = np.array([(-1.0) ** k / math.factorial(2 * k + 1) for k in range(7)])
+_NODES, _WEIGHTS = 0.5 * _roots, 0.5 * _root_weights
+_INTEGRALS = _integrals(_NODES)
+# Factors of even powers in the series of (cosh(z) - 1) / z^2, sinh(z) / z, cos(z) and sin(z) / z. The first factor left
+# out changes a result by less than 2e-15 where |z| <= 0.152.
+_NUM_TERMS = 5
+_COSH = np.array([1.0 / math.factorial(2 * k + 2) for k in range(_NUM_TERMS)])
+_SINH = np.array([1.0 / math.factorial(2 * k + 1) for k in range(_NUM_TERMS)])
+_COS = np.array([(-1.0) ** k / math.factorial(2 * k) for k in range(_NUM_TERMS)])
+_SIN = np.array([(-1.0) ** k / math.factorial(2 * k + 1) for k in range(_NUM_TERMS)])
+# Rows of values at the nodes: the direction U, g times the velocity (`TURN`: g times U), r U, and g.
+_UNIT_X, _UNIT_Y, _TURNED_X, _TURNED_Y, _LATE_X, _LATE_Y, _G, _NUM_ROWS = range(8)
+# Rows of effects on the final position, x and y, by an entry of the state; then rows of effects on other entries.
+_BY_YAW, _BY_SPEED, _BY_RATE, _BY_ACCEL = 0, 2, 4, 6
+_TURN_BY_RATE, _RATE_BY_RATE, _SPEED_BY_ACCEL, _ACCEL_BY_ACCEL = 8, 9, 10, 11
+# Row of the factor t^2 / p, and the number of rows.
+_SHARE, _NUM_EFFECTS = 12, 13
 
 _TYPES = (
     f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
@@ -77,44 +87,317 @@ def check_noise(kind: int, noise: FloatArray, n: int) -> None:
 
 
 @inlined
-def _relaxed(r: float, b: float) -> float:
-    """Value of (exp(b r) - 1) / b for |b r| <= `MAX_RELAXATION`."""
-    total = 0.0
-    for k in range(len(_GROWTH) - 1, -1, -1):
-        total = total * b * r + _GROWTH[k]
-    return r * total
+def _angles(r: float, b: float) -> tuple[float, float]:
+    """Return g(r) and g(-r), with g(r) = (exp(b r) - 1) / b, for |b| <= `MAX_RELAXATION` and 0 < r <= 1/2.
 
-
-@inlined
-def _directions(w: float, t: float, b: float, nodes: FloatArray) -> None:
-    """Write cosine and sine of the heading relative to that at the end, g, and g times both, at each node r.
-
-    At a time r t before the end the heading is -w t g(r) with the yaw rate w at the end, see `_relaxed`.
+    They are the sum and the difference of an even part, (cosh(b r) - 1) / b, and an odd part, sinh(b r) / b.
     """
-    for j in range(_NUM_NODES):
-        g = _relaxed(_NODES[j], b)
-        angle = -w * t * g
-        square = angle * angle
-        along, left = 0.0, 0.0
-        for k in range(len(_COS) - 1, -1, -1):
-            along = along * square + _COS[k]
-            left = left * square + _SIN[k]
-        left *= angle
-        nodes[j, 0], nodes[j, 1], nodes[j, 2] = along, left, g
-        nodes[j, 3], nodes[j, 4] = g * along, g * left
+    square = (b * r) * (b * r)
+    even, odd = 0.0, 0.0
+    for k in range(_NUM_TERMS - 1, -1, -1):
+        even = even * square + _COSH[k]
+        odd = odd * square + _SINH[k]
+    even *= b * r * r
+    odd *= r
+    return even + odd, even - odd
 
 
 @inlined
-def _integrated(i: int, nodes: FloatArray) -> tuple[float, float, float, float]:
-    """Return the integrals of the direction U and of g U from 0 to node i, or to 1, as real and imaginary parts."""
-    unit_x, unit_y, turned_x, turned_y = 0.0, 0.0, 0.0, 0.0
+def _direction(angle: float) -> tuple[float, float]:
+    """Cosine and sine of an angle of at most 0.152 rad, the largest angle between the middle and an end of a part."""
+    square = angle * angle
+    cosine, sine = 0.0, 0.0
+    for k in range(_NUM_TERMS - 1, -1, -1):
+        cosine = cosine * square + _COS[k]
+        sine = sine * square + _SIN[k]
+    return cosine, sine * angle
+
+
+@inlined
+def _write_directions(w: float, t: float, b: float, at: FloatArray) -> None:
+    """Write g and the direction U = exp(-i w t g) at each node to rows of `at` (rows, nodes), see `_write_arc`."""
+    middle = _NUM_NODES // 2
+    at[_G, middle], at[_UNIT_X, middle], at[_UNIT_Y, middle] = 0.0, 1.0, 0.0
+    for j in range(middle):
+        late = _NUM_NODES - 1 - j
+        at[_G, late], at[_G, j] = _angles(_NODES[late], b)
+        at[_UNIT_X, j], at[_UNIT_Y, j] = _direction(-w * t * at[_G, j])
+        at[_UNIT_X, late], at[_UNIT_Y, late] = _direction(-w * t * at[_G, late])
+
+
+@inlined
+def _integrate(num_rows: int, at: FloatArray, integrals: FloatArray) -> None:
+    """Write integrals of the first rows of `at` (rows, nodes), from the end to each node and to the beginning.
+
+    The shape of `integrals` is (rows, nodes + 1).
+    """
+    for row in range(num_rows):
+        for i in range(_NUM_NODES + 1):
+            total = 0.0
+            for j in range(_NUM_NODES):
+                total += _INTEGRALS[i, j] * at[row, j]
+            integrals[row, i] = total
+
+
+@inlined
+def _sums(
+    weights: FloatArray, effect: FloatArray, row: int
+) -> tuple[float, float, float, float, float]:
+    """Weighted sums of x x, x y, y y, x and y over the nodes; x and y are the rows of `effect` from `row` on."""
+    xx, xy, yy, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(_NUM_NODES):
+        x, y = effect[row, i], effect[row + 1, i]
+        share_x, share_y = weights[i] * x, weights[i] * y
+        xx += share_x * x
+        xy += share_x * y
+        yy += share_y * y
+        sum_x += share_x
+        sum_y += share_y
+    return xx, xy, yy, sum_x, sum_y
+
+
+@inlined
+def _coupled_sums(
+    effect: FloatArray, row: int, own: int
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """Weighted sums over the nodes of x x, x y, y y, x a, y a, x b, y b, a a, a b and b b.
+
+    x and y are the rows of `effect` from `row` on, a and b the rows from `own` on.
+    """
+    xx, xy, yy, xa, ya, xb, yb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    aa, ab, bb = 0.0, 0.0, 0.0
+    for i in range(_NUM_NODES):
+        x, y = effect[row, i], effect[row + 1, i]
+        a, b = effect[own, i], effect[own + 1, i]
+        share_x, share_y = _WEIGHTS[i] * x, _WEIGHTS[i] * y
+        share_a, share_b = _WEIGHTS[i] * a, _WEIGHTS[i] * b
+        xx += share_x * x
+        xy += share_x * y
+        yy += share_y * y
+        xa += share_a * x
+        ya += share_a * y
+        xb += share_b * x
+        yb += share_b * y
+        aa += share_a * a
+        ab += share_a * b
+        bb += share_b * b
+    return xx, xy, yy, xa, ya, xb, yb, aa, ab, bb
+
+
+@inlined
+def _write_rate_effects(
+    b: float,
+    t: float,
+    first_g: float,
+    last_g: float,
+    at: FloatArray,
+    effect: FloatArray,
+) -> None:
+    """Write the effects of the yaw rate at each node, and at the beginning, on the final yaw and yaw rate."""
+    last_p = 1.0 + b * last_g
+    for i in range(_NUM_NODES + 1):
+        g = at[_G, i] if i < _NUM_NODES else first_g
+        share = 1.0 / (1.0 + b * g)
+        effect[_SHARE, i] = t * t * share
+        effect[_TURN_BY_RATE, i] = t * (g - last_g) * share
+        effect[_RATE_BY_RATE, i] = last_p * share
+
+
+@inlined
+def _write_column(
+    M: FloatArray, k: int, x: float, y: float, c: float, s: float
+) -> None:
+    """Write x along and y left of the heading with this cosine and sine to the rows of the position in column k."""
+    M[0, k] = c * x - s * y
+    M[1, k] = s * x + c * y
+
+
+@inlined
+def _mirror(n: int, Q: FloatArray) -> None:
+    """Copy the upper triangle to the lower triangle."""
+    for j in range(n):
+        for k in range(j):
+            Q[j, k] = Q[k, j]
+
+
+@inlined
+def _write_identity(n: int, F: FloatArray) -> None:
+    """Write the identity matrix."""
+    for j in range(n):
+        for k in range(n):
+            F[j, k] = 1.0 if j == k else 0.0
+
+
+@inlined
+def _write_arc_integrals(
+    n: int, v: float, accel: float, t: float, at: FloatArray, integrals: FloatArray
+) -> None:
+    """Write the integrals of U, of g V with the velocity V, and with an acceleration of r U, see `_integrate`."""
     for j in range(_NUM_NODES):
-        share = _INTEGRALS[i, j]
-        unit_x += share * nodes[j, 0]
-        unit_y += share * nodes[j, 1]
-        turned_x += share * nodes[j, 3]
-        turned_y += share * nodes[j, 4]
-    return unit_x, unit_y, turned_x, turned_y
+        turned = at[_G, j] * (v - accel * t * _NODES[j])
+        at[_TURNED_X, j] = turned * at[_UNIT_X, j]
+        at[_TURNED_Y, j] = turned * at[_UNIT_Y, j]
+        if n > 5:
+            at[_LATE_X, j] = _NODES[j] * at[_UNIT_X, j]
+            at[_LATE_Y, j] = _NODES[j] * at[_UNIT_Y, j]
+    _integrate(6 if n > 5 else 4, at, integrals)
+
+
+@inlined
+def _write_arc_effects(
+    n: int,
+    v: float,
+    accel: float,
+    t: float,
+    first_g: float,
+    at: FloatArray,
+    integrals: FloatArray,
+    effect: FloatArray,
+) -> None:
+    """Write the effects of the state at each node, and at the beginning, on the final position.
+
+    The integrals run from the end to r. The effect of the yaw is i t int V, of the speed t int U, of the yaw rate
+    i t^2 (g(r) int V - int g V) / p(r), and of the acceleration t^2 (r int U - int s U).
+    """
+    for i in range(_NUM_NODES + 1):
+        is_node = i < _NUM_NODES
+        unit_x, unit_y = integrals[_UNIT_X, i], integrals[_UNIT_Y, i]
+        way_x, way_y = v * unit_x, v * unit_y
+        if n > 5:
+            r = _NODES[i] if is_node else 0.5
+            late_x, late_y = integrals[_LATE_X, i], integrals[_LATE_Y, i]
+            way_x -= accel * t * late_x
+            way_y -= accel * t * late_y
+            effect[_BY_ACCEL, i] = t * t * (r * unit_x - late_x)
+            effect[_BY_ACCEL + 1, i] = t * t * (r * unit_y - late_y)
+            effect[_SPEED_BY_ACCEL, i] = t * (r + 0.5)
+            effect[_ACCEL_BY_ACCEL, i] = 1.0
+        g, share = at[_G, i] if is_node else first_g, effect[_SHARE, i]
+        effect[_BY_YAW, i], effect[_BY_YAW + 1, i] = -t * way_y, t * way_x
+        effect[_BY_SPEED, i], effect[_BY_SPEED + 1, i] = t * unit_x, t * unit_y
+        effect[_BY_RATE, i] = share * (integrals[_TURNED_Y, i] - g * way_y)
+        effect[_BY_RATE + 1, i] = share * (g * way_x - integrals[_TURNED_X, i])
+
+
+@inlined
+def _yaw_density(v: float, n: int, noise: FloatArray) -> float:
+    """Spectral density of the yaw at the speed v; it is larger for slow objects."""
+    ratio = v / noise[n + 1]
+    slowness = 1.0 / (1.0 + ratio * ratio)
+    density: float = noise[2] + noise[n + 2] * slowness * slowness
+    return density
+
+
+@inlined
+def _yaw_sums(
+    n: int,
+    v: float,
+    accel: float,
+    t: float,
+    noise: FloatArray,
+    speed: tuple[float, float, float, float, float],
+    effect: FloatArray,
+) -> tuple[float, float, float, float, float, float]:
+    """Return the integral of the spectral density of the yaw, and `_sums` of the yaw's effects times this density.
+
+    At a constant speed the effects of the yaw are i v times the effects of the speed, whose sums are `speed`.
+    """
+    if n == 5:
+        q = _yaw_density(v, n, noise) * t
+        xx, xy, yy, x, y = speed
+        return q, q * v * v * yy, -q * v * v * xy, q * v * v * xx, -q * v * y, q * v * x
+    weights, total = scratch(_NUM_NODES), 0.0
+    for i in range(_NUM_NODES):
+        weights[i] = _yaw_density(v - accel * t * _NODES[i], n, noise) * t * _WEIGHTS[i]
+        total += weights[i]
+    xx, xy, yy, x, y = _sums(weights, effect, _BY_YAW)
+    return total, xx, xy, yy, x, y
+
+
+@inlined
+def _write_arc_noise(
+    n: int,
+    t: float,
+    noise: FloatArray,
+    c: float,
+    s: float,
+    speed: tuple[float, float, float, float, float],
+    yaw: tuple[float, float, float, float, float, float],
+    effect: FloatArray,
+    Q: FloatArray,
+) -> None:
+    """Write the upper triangle of Q: spectral densities times the sums over the nodes of products of effects."""
+    rate = _coupled_sums(effect, _BY_RATE, _TURN_BY_RATE)
+    q, r = noise[3] * t, noise[4] * t
+    xx = yaw[1] + q * speed[0] + r * rate[0]
+    xy = yaw[2] + q * speed[1] + r * rate[1]
+    yy = yaw[3] + q * speed[2] + r * rate[2]
+    speed_x, speed_y = q * speed[3], q * speed[4]
+    Q[2, 2], Q[2, 3], Q[3, 3] = yaw[0] + r * rate[7], 0.0, q
+    Q[2, 4], Q[3, 4], Q[4, 4] = r * rate[8], 0.0, r * rate[9]
+    _write_column(Q, 2, yaw[4] + r * rate[3], yaw[5] + r * rate[4], c, s)
+    _write_column(Q, 4, r * rate[5], r * rate[6], c, s)
+    if n > 5:
+        a = noise[5] * t
+        late = _coupled_sums(effect, _BY_ACCEL, _SPEED_BY_ACCEL)
+        xx, xy, yy = xx + a * late[0], xy + a * late[1], yy + a * late[2]
+        speed_x, speed_y = speed_x + a * late[3], speed_y + a * late[4]
+        Q[3, 3] += a * late[7]
+        Q[2, 5], Q[3, 5], Q[4, 5], Q[5, 5] = 0.0, a * late[8], 0.0, a
+        _write_column(Q, 5, a * late[5], a * late[6], c, s)
+    _write_column(Q, 3, speed_x, speed_y, c, s)
+    Q[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy + noise[0] * t
+    Q[1, 1] = s * s * xx + 2.0 * c * s * xy + c * c * yy + noise[1] * t
+    Q[0, 1] = c * s * (xx - yy) + (c * c - s * s) * xy
+
+
+@inlined
+def _write_arc(
+    n: int,
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+) -> None:
+    """Write mean, F and Q of the state x, y, yaw, speed, yaw rate and, for n = 6, acceleration after a short arc.
+
+    Positions are complex numbers along and left of the heading in the middle of the arc. At a time r t before the
+    middle the yaw rate is w p(r) and the heading is -w t g(r). Here w is the yaw rate in the middle, p = exp(b r),
+    g = (p - 1) / b, and b is t times the rate of relaxation. So r is 1/2 at the beginning and -1/2 at the end. F has
+    the effects of the state at the beginning on the state at the end. Q is the integral over r of products of effects.
+    """
+    accel = x[5] if n > 5 else 0.0
+    b = noise[n] * t
+    first_g, last_g = _angles(0.5, b)
+    w, v = x[4] / (1.0 + b * first_g), x[3] + 0.5 * accel * t
+    yaw = x[2] + w * t * first_g
+    c, s = math.cos(yaw), math.sin(yaw)
+    at, integrals = scratch(_NUM_ROWS, _NUM_NODES), scratch(_NUM_ROWS, _NUM_NODES + 1)
+    effect = scratch(_NUM_EFFECTS, _NUM_NODES + 1)
+    _write_directions(w, t, b, at)
+    _write_arc_integrals(n, v, accel, t, at, integrals)
+    _write_rate_effects(b, t, first_g, last_g, at, effect)
+    _write_arc_effects(n, v, accel, t, first_g, at, integrals, effect)
+    speed_sums = _sums(_WEIGHTS, effect, _BY_SPEED)
+    yaw_sums = _yaw_sums(n, v, accel, t, noise, speed_sums, effect)
+    _write_arc_noise(n, t, noise, c, s, speed_sums, yaw_sums, effect, Q)
+    _mirror(n, Q)
+    _write_identity(n, F)
+    first = _NUM_NODES
+    for k in range(2, n):
+        row = 2 * (k - 2)
+        _write_column(F, k, effect[row, first], effect[row + 1, first], c, s)
+    F[2, 4], F[4, 4] = effect[_TURN_BY_RATE, first], effect[_RATE_BY_RATE, first]
+    way_x, way_y = effect[_BY_YAW + 1, first], -effect[_BY_YAW, first]
+    mean[0] = x[0] + c * way_x - s * way_y
+    mean[1] = x[1] + s * way_x + c * way_y
+    mean[2] = yaw - w * t * last_g
+    mean[3] = x[3] + accel * t
+    mean[4] = F[4, 4] * x[4]
+    if n > 5:
+        F[3, 5], mean[5] = t, accel
 
 
 @shared(f"void({_TYPES})")
@@ -126,106 +409,67 @@ def _short_arc(
     F: FloatArray,
     Q: FloatArray,
 ) -> None:
-    """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
+    """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`: `_write_arc`, compiled for 5 and for 6 states."""
+    if len(x) == 5:
+        _write_arc(5, x, t, noise, mean, F, Q)
+    else:
+        _write_arc(6, x, t, noise, mean, F, Q)
 
-    Positions are complex numbers along and left of the heading at the end. At a time r t before the end the yaw rate is
-    w p(r) and the heading is -w t g(r), with the yaw rate w at the end, p = exp(b r), g = (p - 1) / b and b the time t
-    times the rate of relaxation. With integrals over s in [0, r] of the velocity V(s) and of the direction U(s), the
-    final position depends on yaw, speed, yaw rate and acceleration at r by i t int V, t int U,
-    i t^2 (g(r) int V - int g V) / p(r) and t^2 (r int U - int s U).
-    """
-    n = len(x)
-    accel = x[5] if n > 5 else 0.0
-    b = noise[n] * t
-    last_g = _relaxed(1.0, b)
-    last_p = 1.0 + b * last_g
-    w = x[4] / last_p
-    v = x[3] + accel * t
-    for j in range(n):
-        mean[j] = x[j]
-        for k in range(n):
-            F[j, k] = 1.0 if j == k else 0.0
-            Q[j, k] = 0.0
-    mean[2], mean[3], mean[4] = x[2] + w * t * last_g, v, w
-    nodes, extra = scratch(_NUM_NODES, 5), scratch(_NUM_NODES)
-    _directions(w, t, b, nodes)
-    for j in range(_NUM_NODES):
-        ratio = (v - accel * _NODES[j] * t) / noise[n + 1]
-        slowness = 1.0 / (1.0 + ratio * ratio)
-        extra[j] = noise[n + 2] * slowness * slowness
-    c, s = math.cos(mean[2]), math.sin(mean[2])
+
+@inlined
+def _write_turn_effects(
+    vx: float,
+    vy: float,
+    t: float,
+    first_g: float,
+    at: FloatArray,
+    integrals: FloatArray,
+    effect: FloatArray,
+) -> None:
+    """Write t int U at each node and at the beginning, and the effect of the yaw rate there on the final position."""
     for i in range(_NUM_NODES + 1):
-        is_end = i == _NUM_NODES
-        r, g, p = (
-            (1.0, last_g, last_p)
-            if is_end
-            else (_NODES[i], nodes[i, 2], 1.0 + b * nodes[i, 2])
-        )
-        unit_x, unit_y, turned_x, turned_y = _integrated(i, nodes)
-        unit_x, unit_y = t * unit_x, t * unit_y
-        way_x, way_y, late_x, late_y = v * unit_x, v * unit_y, 0.0, 0.0
-        turned_x, turned_y = v * t * turned_x, v * t * turned_y
-        if n > 5:  # minus the acceleration times the time
-            for j in range(_NUM_NODES):
-                share = t * _INTEGRALS[i, j] * _NODES[j]
-                late_x += share * nodes[j, 0]
-                late_y += share * nodes[j, 1]
-                turned_x -= accel * t * share * nodes[j, 3]
-                turned_y -= accel * t * share * nodes[j, 4]
-            way_x -= accel * t * late_x
-            way_y -= accel * t * late_y
-        for k in range(2, n):
-            # The derivatives of position, yaw or speed, and its rate at the end by entry k at r.
-            if k == 2:
-                right, up, first, second = -way_y, way_x, 1.0, 0.0
-            elif k == 3:
-                right, up, first, second = unit_x, unit_y, 1.0, 0.0
-            elif k == 4:
-                right, up = (
-                    -t * (g * way_y - turned_y) / p,
-                    t * (g * way_x - turned_x) / p,
-                )
-                first, second = t * g / p, 1.0 / p
-            else:
-                right, up, first, second = (
-                    t * (r * unit_x - late_x),
-                    t * (r * unit_y - late_y),
-                    t * r,
-                    1.0,
-                )
-            own = 2 + k % 2
-            if is_end:
-                F[0, k], F[1, k] = c * right - s * up, s * right + c * up
-                F[own, k] = first
-                if k > 3:
-                    F[k, k] = second
-                continue
-            q = noise[k] + extra[i] if k == 2 else noise[k]
-            q *= t * _WEIGHTS[i]
-            Q[0, 0] += q * right * right
-            Q[0, 1] += q * right * up
-            Q[1, 1] += q * up * up
-            Q[0, own] += q * right * first
-            Q[1, own] += q * up * first
-            Q[own, own] += q * first * first
-            if k > 3:
-                Q[0, k] += q * right * second
-                Q[1, k] += q * up * second
-                Q[own, k] += q * first * second
-                Q[k, k] += q * second * second
-        if is_end:
-            mean[0] += c * way_x - s * way_y
-            mean[1] += s * way_x + c * way_y
-    right, cross, up = Q[0, 0], Q[0, 1], Q[1, 1]
-    Q[0, 0] = c * c * right - 2.0 * c * s * cross + s * s * up + noise[0] * t
-    Q[1, 1] = s * s * right + 2.0 * c * s * cross + c * c * up + noise[1] * t
-    Q[0, 1] = Q[1, 0] = c * s * (right - up) + (c * c - s * s) * cross
-    for k in range(2, n):
-        right, up = Q[0, k], Q[1, k]
-        Q[0, k] = Q[k, 0] = c * right - s * up
-        Q[1, k] = Q[k, 1] = s * right + c * up
-    for k in range(4, n):
-        Q[k, k - 2] = Q[k - 2, k]
+        g, share = at[_G, i] if i < _NUM_NODES else first_g, effect[_SHARE, i]
+        unit_x, unit_y = integrals[_UNIT_X, i], integrals[_UNIT_Y, i]
+        late_x = share * (g * unit_x - integrals[_TURNED_X, i])
+        late_y = share * (g * unit_y - integrals[_TURNED_Y, i])
+        effect[_BY_SPEED, i], effect[_BY_SPEED + 1, i] = t * unit_x, t * unit_y
+        effect[_BY_RATE, i] = -(vx * late_y + vy * late_x)
+        effect[_BY_RATE + 1, i] = vx * late_x - vy * late_y
+
+
+@inlined
+def _write_turn_noise(
+    t: float,
+    noise: FloatArray,
+    last_x: float,
+    last_y: float,
+    vx: float,
+    vy: float,
+    effect: FloatArray,
+    Q: FloatArray,
+) -> None:
+    """Write the upper triangle of Q: spectral densities times the sums over the nodes of products of effects.
+
+    At the end U is last_x + i last_y, and the velocity is (vx, vy).
+    """
+    speed, rate = (
+        _sums(_WEIGHTS, effect, _BY_SPEED),
+        _coupled_sums(effect, _BY_RATE, _TURN_BY_RATE),
+    )
+    q, r = noise[2] * t, noise[4] * t
+    length = q * (speed[0] + speed[2])
+    same = q * (speed[3] * last_x + speed[4] * last_y)
+    other = q * (speed[4] * last_x - speed[3] * last_y)
+    Q[0, 0] = noise[0] * t + length + r * rate[0]
+    Q[0, 1] = r * rate[1]
+    Q[1, 1] = noise[1] * t + length + r * rate[2]
+    Q[0, 2], Q[0, 3] = same - r * rate[3] * vy, r * rate[3] * vx - other
+    Q[1, 2], Q[1, 3] = other - r * rate[4] * vy, r * rate[4] * vx + same
+    Q[0, 4], Q[1, 4] = r * rate[5], r * rate[6]
+    Q[2, 2], Q[3, 3] = q + r * rate[7] * vy * vy, q + r * rate[7] * vx * vx
+    Q[2, 3] = -r * rate[7] * vx * vy
+    Q[2, 4], Q[3, 4] = -r * rate[8] * vy, r * rate[8] * vx
+    Q[4, 4] = r * rate[9]
 
 
 @shared(f"void({_TYPES})")
@@ -239,93 +483,50 @@ def _short_turn(
 ) -> None:
     """Write mean, F and Q of the state x, y, vx, vy, yaw rate after a turn of at most `MAX_TURN_RAD`.
 
-    As in `_short_arc`, with complex numbers in the map. A velocity V that is added at r becomes V / U(r) at the end and
-    moves the position by t V int U / U(r). A yaw rate that is added at r turns the final velocity V by i t g(r) / p(r)
-    V and moves the position by i t^2 V (g(r) int U - int g U) / p(r). Bar-Shalom, Li and Kirubarajan (2001), section
-    11.7, have the model with a yaw rate that does not relax.
+    As in `_write_arc`, with complex numbers in the map. The velocity is V U(r) with the velocity V in the middle. A
+    velocity d added at r becomes d U(-1/2) / U(r) at the end and moves the position by d t int U / U(r). A yaw rate
+    added at r turns the final velocity by t (g(r) - g(-1/2)) / p(r). It moves the position by
+    i t^2 V (g(r) int U - int g U) / p(r). Bar-Shalom, Li and Kirubarajan (2001), section 11.7, have the model with a
+    yaw rate that does not relax.
     """
-    n = len(x)
-    b = noise[n] * t
-    last_g = _relaxed(1.0, b)
-    last_p = 1.0 + b * last_g
-    w = x[4] / last_p
-    angle = w * t * last_g
-    c, s = math.cos(angle), math.sin(angle)
-    vx, vy = c * x[2] - s * x[3], s * x[2] + c * x[3]
-    nodes = scratch(_NUM_NODES, 5)
-    _directions(w, t, b, nodes)
-    for j in range(n):
-        for k in range(n):
-            F[j, k] = 1.0 if j == k else 0.0
-            Q[j, k] = noise[j] * t if j == k and j < 2 else 0.0
-    for i in range(_NUM_NODES + 1):
-        is_end = i == _NUM_NODES
-        unit_x, unit_y, turned_x, turned_y = _integrated(i, nodes)
-        along, left, g = (
-            (c, -s, last_g) if is_end else (nodes[i, 0], nodes[i, 1], nodes[i, 2])
-        )
-        p = 1.0 + b * g
-        # By the velocity: the position moves by (way_x + i way_y) V, the final velocity is (along - i left) V.
-        way_x, way_y = (
-            t * (unit_x * along + unit_y * left),
-            t * (unit_y * along - unit_x * left),
-        )
-        # By the yaw rate.
-        late_x, late_y = (
-            t * t * (g * unit_x - turned_x) / p,
-            t * t * (g * unit_y - turned_y) / p,
-        )
-        right, up = -(vx * late_y + vy * late_x), vx * late_x - vy * late_y
-        turn_s = t * g / p
-        if is_end:
-            F[0, 2], F[0, 3], F[1, 2], F[1, 3] = way_x, -way_y, way_y, way_x
-            F[2, 2], F[2, 3], F[3, 2], F[3, 3] = along, left, -left, along
-            F[0, 4], F[1, 4], F[2, 4], F[3, 4], F[4, 4] = (
-                right,
-                up,
-                -vy * turn_s,
-                vx * turn_s,
-                1.0 / p,
-            )
-            mean[0] = x[0] + way_x * x[2] - way_y * x[3]
-            mean[1] = x[1] + way_y * x[2] + way_x * x[3]
-            mean[2], mean[3], mean[4] = vx, vy, w
-            continue
-        q = noise[2] * t * _WEIGHTS[i]
-        length = q * (way_x * way_x + way_y * way_y)
-        # Position times conjugate velocity.
-        same, other = (
-            q * (way_x * along - way_y * left),
-            q * (way_y * along + way_x * left),
-        )
-        Q[0, 0] += length
-        Q[1, 1] += length
-        Q[0, 2] += same
-        Q[1, 3] += same
-        Q[1, 2] += other
-        Q[0, 3] -= other
-        Q[2, 2] += q
-        Q[3, 3] += q
-        q = noise[4] * t * _WEIGHTS[i]
-        effect_x, effect_y, rate = -vy * turn_s, vx * turn_s, 1.0 / p
-        Q[0, 0] += q * right * right
-        Q[0, 1] += q * right * up
-        Q[1, 1] += q * up * up
-        Q[0, 2] += q * right * effect_x
-        Q[0, 3] += q * right * effect_y
-        Q[1, 2] += q * up * effect_x
-        Q[1, 3] += q * up * effect_y
-        Q[2, 2] += q * effect_x * effect_x
-        Q[2, 3] += q * effect_x * effect_y
-        Q[3, 3] += q * effect_y * effect_y
-        Q[0, 4] += q * right * rate
-        Q[1, 4] += q * up * rate
-        Q[2, 4] += q * effect_x * rate
-        Q[3, 4] += q * effect_y * rate
-        Q[4, 4] += q * rate * rate
-    for j in range(n):
-        for k in range(j):
-            Q[j, k] = Q[k, j]
+    b = noise[5] * t
+    first_g, last_g = _angles(0.5, b)
+    w = x[4] / (1.0 + b * first_g)
+    first_x, first_y = _direction(-w * t * first_g)
+    last_x, last_y = _direction(-w * t * last_g)
+    middle_vx, middle_vy = (
+        first_x * x[2] + first_y * x[3],
+        first_x * x[3] - first_y * x[2],
+    )
+    vx = last_x * middle_vx - last_y * middle_vy
+    vy = last_x * middle_vy + last_y * middle_vx
+    at, integrals = scratch(_NUM_ROWS, _NUM_NODES), scratch(_NUM_ROWS, _NUM_NODES + 1)
+    effect = scratch(_NUM_EFFECTS, _NUM_NODES + 1)
+    _write_directions(w, t, b, at)
+    for j in range(_NUM_NODES):
+        at[_TURNED_X, j] = at[_G, j] * at[_UNIT_X, j]
+        at[_TURNED_Y, j] = at[_G, j] * at[_UNIT_Y, j]
+    _integrate(4, at, integrals)
+    _write_rate_effects(b, t, first_g, last_g, at, effect)
+    _write_turn_effects(middle_vx, middle_vy, t, first_g, at, integrals, effect)
+    _write_turn_noise(t, noise, last_x, last_y, vx, vy, effect, Q)
+    _mirror(5, Q)
+    _write_identity(5, F)
+    first = _NUM_NODES
+    unit_x, unit_y = effect[_BY_SPEED, first], effect[_BY_SPEED + 1, first]
+    way_x, way_y = (
+        unit_x * first_x + unit_y * first_y,
+        unit_y * first_x - unit_x * first_y,
+    )
+    c, s = last_x * first_x + last_y * first_y, last_y * first_x - last_x * first_y
+    F[0, 2], F[0, 3], F[1, 2], F[1, 3] = way_x, -way_y, way_y, way_x
+    F[2, 2], F[2, 3], F[3, 2], F[3, 3] = c, -s, s, c
+    F[0, 4], F[1, 4] = effect[_BY_RATE, first], effect[_BY_RATE + 1, first]
+    turn = effect[_TURN_BY_RATE, first]
+    F[2, 4], F[3, 4], F[4, 4] = -vy * turn, vx * turn, effect[_RATE_BY_RATE, first]
+    mean[0] = x[0] + way_x * x[2] - way_y * x[3]
+    mean[1] = x[1] + way_y * x[2] + way_x * x[3]
+    mean[2], mean[3], mean[4] = vx, vy, F[4, 4] * x[4]
 
 
 @merged

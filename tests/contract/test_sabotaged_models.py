@@ -249,11 +249,9 @@ def test_a_fault_in_the_source_of_the_compiled_transition_is_found(
         ignore=shutil.ignore_patterns("__pycache__"),
     )
     file = tmp_path / "fgtrack" / "models" / "transitions.py"
-    text, right = file.read_text(), "q = noise[k] + extra[i] if k == 2 else noise[k]"
+    text, right = file.read_text(), "q, r = noise[3] * t, noise[4] * t"
     assert text.count(right) == 1
-    file.write_text(
-        text.replace(right, "q = noise[k] + extra[i] if k == 2 else 1.1 * noise[k]")
-    )
+    file.write_text(text.replace(right, "q, r = 1.1 * noise[3] * t, noise[4] * t"))
     script = (
         "from fgtrack.models.motion import CTRV\n"
         "from fgtrack.testing import BrokenPromiseError, check_motion_model\n"
