@@ -235,6 +235,17 @@ def test_files_named_on_the_pages_for_developers_exist(page: str) -> None:
         assert (ROOT / "tests" / test).exists(), f"{page}: {test} does not exist"
 
 
+def test_the_way_of_a_detection_names_functions_that_exist() -> None:
+    text = prose(Path("docs/architecture.md"))
+    rows = re.findall(r"^\| \d+ \| (.+?) \| (.+?) \| .+ \|$", text, re.MULTILINE)
+    assert len(rows) == 10
+    for functions, files in rows:
+        for file in re.findall(r"`(.+?)`", files):
+            source = (ROOT / "fgtrack" / file).read_text(encoding="utf-8")
+            for function in re.findall(r"`(.+?)`", functions):
+                assert f"def {function}(" in source, f"{file} has no {function}"
+
+
 def test_the_picture_of_the_architecture_shows_the_imports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
