@@ -30,7 +30,10 @@ List = dict[int, Measurement]
 def gives_each_of_several_objects_what_it_gives_one_alone(
     subject: Subject, stream: Stream
 ) -> None:
-    """Each list has a measurement of most objects; half way one is removed and another one begins."""
+    """Require of each of several objects the results of an estimator that has this object alone.
+
+    Each list has a measurement of most objects. Half way through, an object is removed and a new object begins.
+    """
     objects = [_shifted(stream, number) for number in range(_NUM_OBJECTS)]
     lists = [  # of what was measured together; each object is missing in every fourth list
         {
@@ -90,7 +93,7 @@ def gives_each_of_several_objects_what_it_gives_one_alone(
 
 
 def _shifted(stream: Stream, number: int) -> Stream:
-    """The stream of another object, a little aside."""
+    """Stream of another object, a little to the side."""
     shift = np.array([0.3, -0.2]) * number
     start: Start = replace(
         stream.start, position_m=tuple(np.add(stream.start.position_m, shift).tolist())
@@ -105,7 +108,7 @@ def _shifted(stream: Stream, number: int) -> Stream:
 def _alone(
     subject: Subject, own: Stream, number: int, lists: Sequence[List], begun: int
 ) -> tuple[Estimator, list[UpdateResult]]:
-    """An estimator that is given what `lists` hold of the object `number`, which began with the list `begun`."""
+    """Estimator of the object `number` alone, which begins with the list `begun`, and its results for `lists`."""
     estimator, results = subject.start(own), list[UpdateResult]()
     now_ns = own.start.stamp_ns
     for index, item in enumerate(lists):
@@ -143,7 +146,7 @@ def _same_results(
 
 
 def _known(state: TrackState, motion: MotionModel) -> TrackState:
-    """The entries of a kinematic state that `motion` has; the others are 0."""
+    """Entries of a kinematic state that `motion` estimates, without entries that are always 0."""
     rows = [
         k
         for k, name in enumerate(STATE_NAMES[: len(state.mean)])
@@ -155,7 +158,7 @@ def _known(state: TrackState, motion: MotionModel) -> TrackState:
 
 
 def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
-    """The kinematic states of the objects now, in their order."""
+    """Require that `present` returns the kinematic states of all objects now, in their order."""
     shown = bank.present()
     require(
         len(shown) == len(bank.track_ids),

@@ -95,8 +95,10 @@ class _Problem:
 def _joint(
     subject: Subject, stream: Stream, stamps_ns: Iterable[int]
 ) -> dict[int, TrackState]:
-    """The joint posterior at stamps. In a nonlinear model it is that of estimators that converge, else the filter's.
-    A filter's posterior is given the measurements up to that stamp.
+    """Reference states at `stamps_ns`, by stamp.
+
+    The reference is the joint posterior in a linear model and for estimators that converge. Else it is the state of a
+    Kalman filter. The reference of a filter uses the measurements up to each stamp.
     """
     claims = Claims(
         smooths=subject.claims.smooths,
@@ -275,7 +277,11 @@ def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
 def _reports_the_innovation_against_all_that_it_has_fused(
     subject: Subject, stream: Stream
 ) -> None:
-    """From later stamps too, where it claims so; of a nonlinear filter it is known for what comes in sequence."""
+    """Require the innovation and the NIS that the state before the measurement predicts.
+
+    The innovation of a late measurement is checked for estimators that predict it from later stamps too. A nonlinear
+    filter is checked for measurements in sequence alone.
+    """
     estimator, claims = subject.start(stream), subject.claims
     fused: list[Measurement] = []
     for measurement in stream.measurements:
@@ -312,7 +318,7 @@ def _reports_the_innovation_against_all_that_it_has_fused(
 
 
 def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> None:
-    """The innovation and NIS are finite; an innovation covariance, where given, is that of the NIS.
+    """Require a finite innovation and NIS; a reported innovation covariance must agree with the NIS.
 
     Every measurement has the same latency: none, one below the lag, and one above the lag. The latency alone makes no
     measurement out of sequence.
@@ -639,10 +645,18 @@ def check_estimator(
 ) -> None:
     """Raise `BrokenPromiseError` unless an estimator keeps the contract, with the measurements that show it.
 
-    `factory` is a class or function `(motion, start, lag_s, **options) -> Estimator` or, where its attribute `bank` is
-    true, `(motion, lag_s, **options) -> TrackBank`; or the name of a registered one. `exact=True` holds it to the dense
-    joint posterior of a linear model in any order of arrival, False does not, text is as in `Claims.exact`; None takes
-    the claims of the factory. `num_streams` random streams are drawn for each promise that speaks of any order.
+    Parameters
+    ----------
+    factory
+        Name of a registered estimator, or a class or function `(motion, start, lag_s, **options) -> Estimator`. A
+        factory with a true attribute `bank` is called as `(motion, lag_s, **options) -> TrackBank`.
+    exact
+        True requires the dense joint posterior of a linear model in any order of arrival; False does not. A text
+        has the meaning of `Claims.exact`. None takes the claims of the factory.
+    seed, num_streams
+        Seed, and number of random streams for each promise about any order of arrival.
+    options
+        Keyword parameters of the factory.
     """
     checks = estimator_checks(
         factory, exact=exact, seed=seed, num_streams=num_streams, **options
@@ -658,7 +672,7 @@ def estimator_checks(
     num_streams: int = 10,
     **options: Any,
 ) -> dict[str, Callable[[], None]]:
-    """The checks of `check_estimator` one by one, by name of the promise: for `pytest.mark.parametrize`."""
+    """Checks of `check_estimator` one by one, by name of the promise, for `pytest.mark.parametrize`."""
     made = ESTIMATORS.load(factory) if isinstance(factory, str) else factory
     claims = Claims.of(made)
     if exact is not None:

@@ -13,7 +13,7 @@ from fgtrack.testing.streams import LAG_S, Stream
 
 
 class BrokenPromiseError(AssertionError):
-    """A contract is broken: `promises` holds what is wrong by name of the promise."""
+    """Error of a broken contract; `promises` holds the fault of each broken promise, by its name."""
 
     def __init__(self, what: str, promises: Mapping[str, str]) -> None:
         super().__init__(
@@ -26,7 +26,7 @@ class BrokenPromiseError(AssertionError):
 
 
 def run_all(what: str, checks: Mapping[str, Callable[[], None]]) -> None:
-    """Run `checks`, each of which raises `BrokenPromiseError` of its own; raise one of all that is broken."""
+    """Run all `checks`; raise one `BrokenPromiseError` with every promise that they report as broken."""
     broken: dict[str, str] = {}
     for check in checks.values():
         try:
@@ -85,13 +85,13 @@ class Subject:
     options: Mapping[str, Any]
 
     def start(self, stream: Stream) -> Estimator:
-        """A new one for the object of `stream`."""
+        """New estimator of the object of `stream`."""
         return start_estimator(
             self.name, self.factory, stream.motion, stream.start, LAG_S, self.options
         )
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
-        """A new one that has taken all of `stream`, and the results."""
+        """New estimator that has fused all of `stream`, and the results."""
         estimator = self.start(stream)
         return estimator, [
             estimator.update(measurement) for measurement in stream.measurements
@@ -110,10 +110,10 @@ class Promise:
     applies: Callable[[Claims], bool] = lambda claims: True
     """True if an estimator with these claims promises it."""
     repeats: bool = False
-    """True if it is checked on many streams."""
+    """True if the promise is checked on many streams."""
 
     def run(self, subject: Subject, seed: int, num_streams: int) -> None:
-        """Raise `BrokenPromiseError` with the smallest part of a stream that still breaks it."""
+        """Raise `BrokenPromiseError` with the smallest part of a stream that still breaks the promise."""
         for kind, draw in enumerate(self.draws):
             for number in range(num_streams if self.repeats else 1):
                 stream = draw(np.random.default_rng([seed, kind, number]))

@@ -1,7 +1,8 @@
 """References of the contract: plain calculations that share no recursion, graph, factor or model with any estimator.
 
-All take the measurements in the order of the stamps or all at once, so there is no order of arrival in them. Motion and
-measurements are those of `fgtrack.testing.equations`, not the shipped models. The prior of a new object is shared.
+All references take the measurements in the order of their stamps, or all at once. So their results do not depend on the
+order of arrival. Motion and measurements come from `fgtrack.testing.equations`, not from the shipped models. The prior
+of a new object is shared with the estimators.
 """
 
 import math

@@ -60,7 +60,7 @@ class Stream:
 
     @property
     def content(self) -> Hashable:
-        """All of the stream, as a value that two equal streams share."""
+        """Value that is equal for equal streams."""
         return (
             self.motion,
             repr(self.start),
@@ -96,7 +96,7 @@ def measured(
     offset_ns: int,
     names: Sequence[str] = _POSITION,
 ) -> Measurement:
-    """`names` of an object that drives straight on, `offset_ns` after the start.
+    """Measurement of the components `names` of an object that drives straight on, `offset_ns` after the start.
 
     A range, a bearing or a Doppler is seen from a vehicle that follows beside the object and turns.
     """
@@ -125,7 +125,7 @@ def measured(
 
 
 def regular(motion: MotionModel, rng: np.random.Generator, num: int = 12) -> Stream:
-    """In time order, every 50 ms; in a nonlinear model any of `COMPONENTS`."""
+    """Stream in time order, every 50 ms; in a nonlinear model a measurement has any of `COMPONENTS`."""
     return Stream(
         motion,
         tuple(
@@ -150,7 +150,7 @@ def shuffled(
 
 
 def one_late(steps: int, rng: np.random.Generator) -> Stream:
-    """In time order, every 100 ms, and then one measurement from between two stamps, `steps` of them late."""
+    """Stream in time order, every 100 ms, with a last measurement between two stamps that is `steps` steps late."""
     stamps_ns = [k * 100 * MS for k in range(1, 10)]
     late_ns = stamps_ns[-1] - steps * 100 * MS + int(rng.integers(20, 80)) * MS
     return Stream(
@@ -206,7 +206,7 @@ def _turned(x: FloatArray, after_s: float) -> FloatArray:
 
 
 def with_outliers(rng: np.random.Generator) -> Stream:
-    """The same with a Huber loss. Half of the measurements have errors of eight standard deviations."""
+    """Stream of `informative` with a Huber loss; half of the measurements have errors of eight standard deviations."""
     stream = informative(rng)
     measurements = []
     for item in stream.measurements:

@@ -20,9 +20,9 @@ class IekfReplay(ReplayEkf):
     """Iterated EKF with replay: each update is linearised at its own result (Gauss-Newton).
 
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
-    38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss instead of
-    the latter. A step that does not lower this sum is halved, one below 1e-6 standard deviations of the
-    prediction is the last. A linear measurement is fused as by `ReplayEkf`.
+    38(2), 1993. The update minimises half of |x - x_0|^2 in P^-1 plus half of |z - h(x)|^2 in R^-1. A robust loss
+    replaces the second term. A step that does not lower this sum is halved. The iteration ends with a step below 1e-6
+    standard deviations of the prediction. A linear measurement is fused as by `ReplayEkf`.
     """
 
     iterates = True
@@ -68,7 +68,10 @@ def descended(
     start: FloatArray,
     end: FloatArray,
 ) -> FloatArray:
-    """Farthest point from `start` (n,) to `end` (n,), by halving, with a `cost` of at most `limit`; else `start`."""
+    """First point on the way back from `end` (n,) to `start` (n,) whose `cost` is at most `limit`; else `start`.
+
+    The step from `start` is halved until the cost is low enough.
+    """
     step = end - start
     for _ in range(_MAX_HALVINGS):
         if cost(start + step) <= limit:
@@ -92,8 +95,9 @@ def negative_log_posterior(
     R: FloatArray,
     loss: RobustLoss | None,
 ) -> float:
-    """Cost that an update minimises: half of off' P^-1 off, and the loss of the residual (k,) in R (k, k).
-    `off` (n,) is the step from the prior with covariance P (n, n).
+    """Cost that an update minimises: half of off' P^-1 off, plus the loss of the residual (k,) in R (k, k).
+
+    `off` (n,) is the step from the prior, whose covariance is P (n, n).
     """
     return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(
         loss, _length(residual, R), len(R)
@@ -109,9 +113,11 @@ def reweighted(
     loss: RobustLoss | None,
     off: FloatArray,
 ) -> OneCorrection:
-    """`updated_one` with a measurement that is linearised `off` (n,) from the prior, with the `residual` (k,) there.
-    Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, so the
-    step lowers `negative_log_posterior`; at the prior itself it is that of the whole update.
+    """Update of the prior by a measurement that is linearised at a step `off` (n,) from the prior.
+
+    `residual` (k,) is the residual at the point of linearisation. The innovation at the prior is residual + H off. A
+    robust loss weighs the measurement by this residual, so the step lowers `negative_log_posterior`. At the prior
+    itself `updated_one` computes the weight.
     """
     y = residual + H.dot(off)
     if loss is None or not off.any():

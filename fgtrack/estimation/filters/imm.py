@@ -1,4 +1,4 @@
-"""The interacting multiple model filter, in continuous time, so that late measurements can be rewound to."""
+"""The interacting multiple model filter in continuous time, so that it can roll back to a late measurement."""
 
 import math
 from dataclasses import fields, replace
@@ -25,7 +25,7 @@ from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel
 from fgtrack.models.robust import penalty
 
-#: Of no model the probability falls below this, so that it can come back.
+#: Smallest probability of a model, so that the model can become probable again.
 _LEAST = 1e-12
 
 
@@ -34,12 +34,12 @@ class ImmReplay(ReplayEkf):
 
     Blom and Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching coefficients,
     IEEE Transactions on Automatic Control 33(8), 1988, with a Markov chain in continuous time (see `transition`). Each
-    step of the window keeps the states by both models and their probabilities, so the order of arrival does not matter.
-    With one model it is `ReplayEkf`. The innovation of a late measurement is predicted from those before it alone.
+    step of the window keeps the states of both models and their probabilities, so the order of arrival does not matter.
+    With one model the filter is `ReplayEkf`. The innovation of a late measurement is predicted from the earlier
+    measurements alone.
 
-    `other` is a model or its name; by default CTRA with the noise of `motion` beside CTRV, CTRV beside CTRA, and
-    CV beside CT.
-    `stay_s` is the mean sojourn time in each.
+    `other` is a model or its name. The default is CTRA with the noise of `motion` beside CTRV, CTRV beside CTRA, and CV
+    beside CT. `stay_s` is the mean sojourn time in each model.
     """
 
     spreads = mixes = True
@@ -73,14 +73,15 @@ class ImmReplay(ReplayEkf):
         ]
 
     def transition(self, dt_s: float) -> FloatArray:
-        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m); it composes.
+        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m), which composes.
+
         exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) / m, with r = m over the mean sojourn time.
         """
         m, same = len(self._models), math.exp(-self._rate_hz * dt_s)
         return np.asarray(same * identity(m) + (1.0 - same) / m)
 
     def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
-        """See `ReplayEkf._ahead`; the cross-covariance, which is not used, is the covariance."""
+        """See `ReplayEkf._ahead`. The cross-covariance is not used; the covariance stands for it."""
         mixture = self._mixed(before, stamp_ns)
         mean, covariance = self._moments(mixture, mixture.probabilities, self._motion)
         return Prediction(mean, covariance, covariance)

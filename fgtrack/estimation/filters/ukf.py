@@ -1,13 +1,14 @@
 """The unscented Kalman filter and the iterated posterior linearisation filter, by statistical linear regression.
 
-The 2 n sigma points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters,
-IEEE Transactions on Automatic Control 54(6), 2009), at sqrt(n) standard deviations along the columns of the
-covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
+The filters use the 2 n sigma points of the third-degree cubature rule (Arasaratnam and Haykin, Cubature Kalman
+filters, IEEE Transactions on Automatic Control 54(6), 2009). The points lie sqrt(n) standard deviations from the mean,
+along the columns of the covariance's root. The mean itself has no weight, so every covariance stays positive
+semidefinite.
 
-These points lie sqrt(n) standard deviations from the mean. Where an angle is so uncertain that they would lie round the
-circle, the functions of the angle are not polynomials of low degree, and the rule fails. Those directions of the
-covariance's root get a rule of their own (see `DenseRule`): equidistant points, at most a radian apart. In the
-other directions, in which the functions are nearly affine, the cubature rule stays. All weights stay positive.
+The cubature rule fails where an angle is very uncertain. The points then lie around the circle, where functions of the
+angle are no polynomials of low degree. The uncertain directions of the covariance's root get equidistant points, at
+most a radian apart (see `DenseRule`). The directions in which the functions are nearly affine keep the cubature rule.
+All weights stay positive.
 """
 
 import math
@@ -35,15 +36,16 @@ from fgtrack.models.motion import MIN_SPEED_MPS
 _JITTER = 1e-12
 #: A direction of a covariance's root is wide where an angle changes by more: cubature points reach twice as far.
 WIDE_RAD = 0.25
-#: The same of the direction, and the relative range, of a line of sight.
+#: A direction is also wide where the direction or the relative range of a line of sight changes by more.
 WIDE_SIGHT_RAD = 0.1
 _REACH = 5.0  # standard deviations up to which equidistant points lie
 _SIGHT_RAD, _MOST_RAD = 2.0, 10.0  # largest spreads that make points denser
 _ROUNDING = 1e-9  # smaller shares of the largest spread are rounding
 _STEP_RAD, _MOST_STEPS = 1e-9, 50  # in the search for a mean on the circle
 Regression = tuple[FloatArray, FloatArray, FloatArray]
-"""z = E[g(x)] (..., k), A (..., k, n), and the covariance (..., k, k) of e, which is uncorrelated with x, in
-g(x) = z + A (x - m) + e for x ~ N(m, P)."""
+"""Terms of g(x) = z + A (x - m) + e for x ~ N(m, P): z (..., k), A (..., k, n), and the covariance of e.
+
+The error e, with a covariance (..., k, k), is uncorrelated with x."""
 
 
 def regression(
@@ -53,9 +55,10 @@ def regression(
     difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
 ) -> Regression:
     """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
-    Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of the root P = L L', c^2 = n, and the
-    differences d+ and d- of g there from g(m): A L_i = (d+ - d-) / 2c, and the noise comes from the bends (d+ + d-) /
-    2, so that it is zero of a linear g. Raises `numpy.linalg.LinAlgError` for a covariance that is not semidefinite.
+
+    Garcia-Fernandez et al. 2015, eqs. 9 to 11. The points are m +- c L_i with P = L L' and c^2 = n. Their values differ
+    from g(m) by d+ and d-. The slope is A L_i = (d+ - d-) / 2c. The noise comes from the bends (d+ + d-) / 2, which are
+    zero for a linear g. Raises `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
     """
     n, L = mean.shape[-1], _root(covariance)
     centre, offsets = mean[..., None, :], n**0.5 * L.mT
@@ -96,13 +99,14 @@ class DenseRule(NamedTuple):
 
         The rows of `turns`, shape (a, n), are gradients of angles whose sines and cosines count. The rows of `sights`,
         shape (b, n), are gradients of the direction and of the logarithm of the range of a line of sight. Rows may be
-        0. A direction of the covariance's root is wide, and gets equidistant points, where an angle changes by more
-        than `WIDE_RAD`, or one of a line of sight by more than `WIDE_SIGHT_RAD`.
+        0. A direction of the covariance's root is wide where an angle changes by more than `WIDE_RAD`. It is also wide
+        where a line of sight changes by more than `WIDE_SIGHT_RAD`. Wide directions get equidistant points.
 
-        For a Gaussian and a smooth periodic function, this trapezoidal rule converges exponentially (Trefethen and
-        Weideman, The exponentially convergent trapezoidal rule, SIAM Review 56(3), 2014). The other directions get the
-        cubature rule, which is exact where a function is affine in them, as for marginalised sigma points (Morelande
-        and Moran, An unscented transformation for conditionally linear models, ICASSP 2007).
+        This trapezoidal rule converges exponentially for a Gaussian and a smooth periodic function (Trefethen and
+        Weideman, The exponentially convergent trapezoidal rule, SIAM Review 56(3), 2014). Narrow directions get the
+        cubature rule, which is exact for functions that are affine along these directions. Marginalised sigma points
+        use the same split (Morelande and Moran, An unscented transformation for conditionally linear models, ICASSP
+        2007).
         """
         n, root, gradients = len(mean), _root(covariance), np.vstack([sights, turns])
         # Directions on which the angles depend come first, the others leave them alone: few directions are wide, and a
@@ -165,9 +169,10 @@ class DenseRule(NamedTuple):
 
 
 def _equidistant(spread_rad: float) -> tuple[FloatArray, FloatArray]:
-    """Points of a standard Gaussian at most a radian apart where a unit is `spread_rad`, and weights; variance 1.
+    """Equidistant points of a standard Gaussian with variance 1, and their weights.
 
-    None lies at the mean: beyond the sensor, such a line of points would see it at half a turn, with either sign.
+    A unit is `spread_rad`; neighbouring points are at most a radian apart. No point lies at the mean. Beyond the
+    sensor, a point at the mean would see the sensor at half a turn, with either sign.
     """
     step, num = min(1.0, 1.0 / spread_rad), math.ceil(_REACH * max(1.0, spread_rad))
     at = step * (np.arange(-num, num) + 0.5)
@@ -177,7 +182,7 @@ def _equidistant(spread_rad: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """L with L L' = covariance; of one that is only semidefinite after a tiny increase."""
+    """Root L with L L' = covariance; a semidefinite covariance is increased a little first."""
     try:
         return np.asarray(np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
@@ -193,7 +198,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 def measurement_regression(
     measurement: Measurement, mean: FloatArray, covariance: FloatArray
 ) -> Regression:
-    """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
+    """Regression of the measurement model; angles that are no entries of the state are averaged on the circle."""
     model, pose = measurement.model, measurement.pose
     rule = _rule_of(measurement, mean, covariance)
     if rule is None:
@@ -231,7 +236,7 @@ def _rule_of(
 def _difference(
     model: MeasurementModel,
 ) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Difference of measurements, angles in their range, but for entries of the state."""
+    """Function of the difference of two measurements; angles that are no entries of the state are wrapped."""
     direct = np.array(
         [k for k, name in enumerate(model.components) if name in model.state_names],
         dtype=np.int64,
@@ -246,11 +251,11 @@ def _difference(
 
 
 class UkfReplay(ReplayEkf):
-    """Unscented Kalman filter with replay: means over the spread of the state instead of derivatives.
+    """Unscented Kalman filter with replay: averages over the spread of the state instead of derivatives.
+
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
-    statistical linear regression (see `regression`). The process noise is that of the mean, and its
-    average where the yaw is uncertain (see `DenseRule`). What is linear it does as
-    `ReplayEkf`.
+    statistical linear regression (see `regression`). The process noise is evaluated at the mean. Where the yaw is
+    uncertain, the process noise is averaged (see `DenseRule`). Linear models are treated as in `ReplayEkf`.
     """
 
     spreads = True
@@ -308,11 +313,11 @@ class IplfReplay(UkfReplay):
     """Iterated posterior linearisation filter with replay: averages over the spread of the posterior.
 
     Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
-    using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is repeated over each
-    posterior that the prior and the last regression give, until mean and standard deviations change by less than
-    a hundredth. With the spread and noise of a regression held, a step of the mean that does not lower the cost is
-    halved (Raitoharju et al., Damped posterior linearization filter, IEEE Signal Processing Letters 25(4), 2018). What
-    is linear it does as `ReplayEkf`.
+    using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The prior and a regression give a
+    posterior, and the next regression is made over this posterior. The iteration ends when mean and standard deviations
+    change by less than a hundredth. A step of the mean that does not lower the cost is halved; the spread and the noise
+    of the regression are held meanwhile (Raitoharju et al., Damped posterior linearization filter, IEEE Signal
+    Processing Letters 25(4), 2018). Linear models are treated as in `ReplayEkf`.
     """
 
     iterates = True

@@ -18,7 +18,7 @@ from fgtrack.models.motion import MotionModel
 
 
 class WindowedFilter(ABC):
-    """An `Estimator` that refuses what is older than its window and fuses the rest by `_fuse`.
+    """An `Estimator` that refuses measurements older than its window and fuses all others by `_fuse`.
 
     The window reaches `lag_s` behind the newest stamp or the clock, and not beyond the stamp of the `prior`. Process
     noise of a motion model composes, so a late measurement may split a stretch of time.
@@ -56,7 +56,7 @@ class WindowedFilter(ABC):
         )
 
     def moved_on(self, stamp_ns: int) -> UpdateStatus:
-        """Status of a measurement that was fused; the window moves on."""
+        """Status of a fused measurement; the window moves to the stamp of the measurement."""
         if stamp_ns < self._newest_ns:
             return UpdateStatus.OUT_OF_SEQUENCE
         self._newest_ns = stamp_ns
@@ -72,10 +72,11 @@ class WindowedFilter(ABC):
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:
-        """Fuse a measurement of the window; None where the method ignores it.
-        Raises `numpy.linalg.LinAlgError`, with all as it was, for one that cannot be fused.
+        """Fuse a measurement of the window; None where the method ignores the measurement.
+
+        Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused; the state is then unchanged.
         """
 
     @abstractmethod
     def _forget_before(self, stamp_ns: int) -> None:
-        """Drop what is not needed for stamps from `stamp_ns` on."""
+        """Drop the states that are not needed for stamps from `stamp_ns` on."""

@@ -16,18 +16,18 @@ from fgtrack.estimation.rts import between
 from fgtrack.models.motion import MotionModel
 
 _Stack = tuple[tuple[int, ...], FloatArray, FloatArray]
-"""N stamps, oldest first, mean (N n,) and covariance (N n, N n) of their states; yaws are continuous, not wrapped."""
+"""N stamps, oldest first, and mean (N n,) and covariance (N n, N n) of their states. Yaws are not wrapped."""
 
 
 class AccumulatedStateDensity(WindowedFilter):
-    """The Gaussian of all states in the window; a measurement at any of their stamps corrects them all.
+    """Joint Gaussian of all states in the window. A measurement at any stamp corrects all states.
 
     Koch and Govaers, On accumulated state densities with applications to out-of-sequence measurement processing, IEEE
     Transactions on Aerospace and Electronic Systems 47(4), 2011; Govaers and Koch, Generalized solution to smoothing
-    and out-of-sequence processing, same journal 50(3), 2014. The present goes on as x_{k+1} = F x_k + v, with the
-    cross-covariances F Cov(x_k, x_j). A stamp between two others becomes a state of its own, x = Lambda x_l + Psi x_r +
-    N(0, Sigma) (see `between`), with the cross-covariances [Lambda Psi] Cov([x_l; x_r], x_j). Every measurement, late
-    or not, is `fuse_across` of the whole stack.
+    and out-of-sequence processing, same journal 50(3), 2014. The next state is x_{k+1} = F x_k + v, with the
+    cross-covariances F Cov(x_k, x_j). A stamp between two neighbours becomes a state x = Lambda x_l + Psi x_r + N(0,
+    Sigma) (see `between`). Its cross-covariances are [Lambda Psi] Cov([x_l; x_r], x_j). Every measurement, late or not,
+    corrects the whole stack by `fuse_across`.
 
     Exact for: any lag, any number of late measurements in any order. States in the past are smoothed.
     """

@@ -19,12 +19,12 @@ from fgtrack.models.motion import MotionModel
 
 
 class DelayedHorizon:
-    """Run the filter at now - D, and predict from there to now.
+    """Filter at the front, now - D, with a prediction from the front to now.
 
-    Now is the clock, or the newest stamp where that is ahead, so D = `horizon_s` has to cover the longest delay. As in
-    flight controllers (the delayed fusion horizon of the PX4 EKF). Later measurements are held in order of their
-    stamps, earlier ones are too old. Innovation and NIS are predicted from all measurements that have come, held ones
-    included.
+    Now is the clock, or the newest stamp if that is later. So D = `horizon_s` has to cover the longest delay. Flight
+    controllers work like this (the delayed fusion horizon of the PX4 EKF). Measurements after the front are held in
+    order of their stamps. Measurements before the front are too old. Innovation and NIS are predicted from all
+    measurements that have arrived, held measurements included.
 
     Exact for: the state at now - D, linear model, any number of measurements with delays up to D.
     """
@@ -52,12 +52,12 @@ class DelayedHorizon:
 
     @property
     def window_ns(self) -> tuple[int, int]:
-        """See `Estimator.window_ns`; what lies behind the front can be asked for, but not be fused any more."""
+        """See `Estimator.window_ns`. States before the front are available, but no measurement before it is fused."""
         return self._ordered.window_ns
 
     @property
     def _front_ns(self) -> int:
-        """Stamp up to which measurements count."""
+        """Stamp up to which measurements are filtered."""
         return self._now_ns - self._hold_ns
 
     def advance(self, now_ns: int) -> None:
@@ -76,7 +76,7 @@ class DelayedHorizon:
         return result
 
     def state_at(self, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: after the front it is pure prediction."""
+        """See `Estimator.state_at`; a state after the front is a prediction."""
         stamp_ns = as_stamp("stamp_ns", stamp_ns)
         front_ns = max(self._front_ns, self.window_ns[0])
         if stamp_ns <= front_ns:
@@ -94,11 +94,11 @@ class DelayedHorizon:
 
 
 class ReorderBuffer(DelayedHorizon):
-    """Hold every measurement until one has come whose stamp is D later, and fuse in order of stamps.
+    """Filter that holds every measurement until a stamp D later has arrived, and fuses in order of stamps.
 
-    The stamps push the front and the clock does not, so D = `hold_s` has to cover only how much later than its
-    successors a measurement comes. As the watermark of stream processing (Akidau et al., The dataflow model,
-    Proceedings of the VLDB Endowment, 2015).
+    The newest stamp moves the front; the clock does not. So D = `hold_s` has to cover only the disorder: the time by
+    which a measurement arrives after measurements with later stamps. Stream processing has the same watermark (Akidau
+    et al., The dataflow model, Proceedings of the VLDB Endowment, 2015).
 
     Exact for: the state D before the newest stamp, linear model, any number of measurements at most D behind it.
     """

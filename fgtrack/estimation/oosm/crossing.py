@@ -1,4 +1,4 @@
-"""Methods by which the past corrects the present through their cross-covariance, and that update itself."""
+"""Methods that correct the present through its cross-covariance with the state at the late stamp."""
 
 from abc import abstractmethod
 
@@ -26,10 +26,11 @@ Past = tuple[FloatArray, FloatArray, FloatArray]
 def fuse_across(
     mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement
 ) -> OneCorrection:
-    """The state x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
+    """State x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
+
     S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
-    2002, see `A1`), with the weight that a robust loss gives R (see `robust_weight`). Raises
-    `numpy.linalg.LinAlgError` where S is not positive definite or the result is not finite.
+    2002, see `A1`). A robust loss divides R by its weight (see `robust_weight`). Raises `numpy.linalg.LinAlgError`
+    where S is not positive definite or the result is not finite.
     """
     x_tau, P_tau, cross = past
     y, H = measurement.model.linearised(measurement.z, x_tau, measurement.pose)
@@ -50,9 +51,10 @@ def fuse_across(
 
 
 class CrossingEkf(RewindForget):
-    """An EKF that corrects the present through its cross-covariance with the past (see `fuse_across`).
-    The corrected present enters the history with an equivalent measurement (see `_absorb`), so a second late
-    measurement starts from it; the steps in between stay as they were.
+    """EKF that corrects the present through its cross-covariance with the past (see `fuse_across`).
+
+    The corrected present enters the history with an equivalent measurement (see `_absorb`). A second late measurement
+    starts from this step. Earlier steps are not changed.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:

@@ -46,12 +46,12 @@ class FilterStep:
 
 
 class RewindForget(WindowedFilter):
-    """Update at the late stamp, and forget what was fused after it.
+    """EKF that updates at the late stamp, and forgets the measurements that were fused after this stamp.
 
     Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
     Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
-    to now. Here at the stamp itself; `fgtrack.karle2023.backward_forward` has the paper's time grid. The other
-    methods override `_fuse_late`; all are linearised at the stored means.
+    to now. This class updates at the stamp itself; `fgtrack.karle2023.backward_forward` has the paper's time grid.
+    Subclasses override `_fuse_late`. All are linearised at the stored means.
 
     Exact for: nothing; consistent, but all measurements between the late stamp and the present are lost.
     """
@@ -81,7 +81,7 @@ class RewindForget(WindowedFilter):
         return self._fuse_late(measurement) if late else self._fuse_next(measurement)
 
     def _fuse_next(self, measurement: Measurement) -> OneCorrection:
-        """Take the ordinary step from the last one before `measurement`, and forget those after it, if it is late."""
+        """Fuse `measurement` after the last step before its stamp; forget all steps after its stamp."""
         index = self._left(measurement.stamp_ns)
         mean, covariance = self._predicted(index, measurement.stamp_ns)
         result = correct_one(mean, covariance, measurement)
@@ -103,11 +103,11 @@ class RewindForget(WindowedFilter):
         return result
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection | None:
-        """Fuse a measurement older than the newest, as `_fuse`."""
+        """Fuse a measurement that is older than the newest stamp; see `_fuse`."""
         return self._fuse_next(measurement)
 
     def _left(self, stamp_ns: int) -> int:
-        """Return the index of the last step that is not after `stamp_ns`, or of the first step, where all are."""
+        """Return the index of the last step that is not after `stamp_ns`; 0 if all steps are after it."""
         return max(
             bisect.bisect_right(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
             - 1,
@@ -128,7 +128,8 @@ class RewindForget(WindowedFilter):
         return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
 
     def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Add a step at the present stamp: its state after a late measurement, `mean` (n,) and `covariance` (n, n).
+        """Add a step at the present stamp with the state after a late measurement: `mean` (n,), `covariance` (n, n).
+
         Its measurement is the equivalent one of Bar-Shalom, Chen and Mallick 2004: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H
         = P^-1 (P - P+) P^-1.
         """
@@ -144,11 +145,11 @@ class RewindForget(WindowedFilter):
 
 
 class Drop(RewindForget):
-    """Ignore a late measurement: it is `too_old`.
+    """EKF that ignores every late measurement: the status is `too_old`.
 
-    The floor of every comparison ("neglect" in the Sensor Fusion and Tracking Toolbox of MathWorks).
+    This is the floor of every comparison ("neglect" in the Sensor Fusion and Tracking Toolbox of MathWorks).
 
-    Exact for: nothing; but consistent, for what is left is in sequence.
+    Exact for: nothing; but consistent, because all fused measurements are in sequence.
     """
 
     def _fuse_late(self, measurement: Measurement) -> None:
@@ -156,8 +157,11 @@ class Drop(RewindForget):
 
 
 class AsCurrent(RewindForget):
-    """Take a late measurement as if it had been made at the newest stamp fused, as a filter without stamps does.
-    Exact for: nothing; overconfident, for the object has moved on by speed times lag since.
+    """EKF that takes a late measurement as if it had been made at the newest fused stamp.
+
+    A filter that ignores stamps does the same.
+
+    Exact for: nothing; overconfident, because the object has moved by speed times lag since the measurement.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
@@ -172,9 +176,9 @@ class Fpfd(RewindForget):
 
         P^-1 = P_k^-1 + P_1^-1 - P_0^-1,   P^-1 x = P_k^-1 x_k + P_1^-1 x_1 - P_0^-1 x_0
 
-    with the present x_k, P_k; step m predicted to tau, corrected there and predicted to now, x_1, P_1; and step m
-    predicted to now, x_0, P_0. That is, both are taken as if they shared x_0 and nothing else; they share the process
-    noise since tau. The steps are not repaired after a late measurement; x_k holds all that came since m.
+    The present is x_k, P_k. Step m, predicted to tau, corrected there and predicted to now, is x_1, P_1. Step m
+    predicted to now is x_0, P_0. The method assumes that both estimates share x_0 and nothing else. In truth they also
+    share the process noise since tau. Steps before the present are not corrected by a late measurement.
 
     Exact for: one lag, the first late measurement since step m. Numerically the same as `Al1` in a linear model.
     """
@@ -201,14 +205,14 @@ class Fpfd(RewindForget):
 
 
 class CovarianceIntersection(Fpfd):
-    """Fuse both estimates for any correlation between them.
+    """Covariance intersection: a fusion of both estimates that holds for any correlation between the two.
 
     Julier and Uhlmann, Fusion of time delayed measurements with uncertain time delays, American Control Conference,
     2005:
 
         P^-1 = w P_k^-1 + (1 - w) P_1^-1,   P^-1 x = w P_k^-1 x_k + (1 - w) P_1^-1 x_1
 
-    with the w in [0, 1] for which the trace of P is smallest, whose entries differ in their units.
+    The weight w in [0, 1] minimises the trace of P, although the entries of P differ in their units.
 
     Exact for: nothing; never overconfident.
     """
@@ -231,5 +235,5 @@ class CovarianceIntersection(Fpfd):
 
 
 def information(covariance: FloatArray) -> FloatArray:
-    """The matrix whose product with `covariance`, shape (n, n), is the identity."""
+    """Inverse of `covariance`, shape (n, n): the information matrix."""
     return symmetrise(psd_solve(covariance, identity(len(covariance))))
