@@ -153,6 +153,8 @@ def _state_factor(
     noise: gtsam.noiseModel.Base,
 ) -> gtsam.NonlinearFactor:
     """Return the factor of a measurement on its state alone."""
+    if measurement.model.linear and not ahead_s:
+        return _linear_factor(measurement, key, noise)
 
     def error(
         this: gtsam.CustomFactor,
@@ -167,6 +169,28 @@ def _state_factor(
         if jacobians is not None:
             jacobians[0] = H
         return -y
+
+    return gtsam.CustomFactor(noise, [key], error)
+
+
+def _linear_factor(
+    measurement: Measurement, key: int, noise: gtsam.noiseModel.Base
+) -> gtsam.NonlinearFactor:
+    """Return the factor of a measurement of entries of the state: its callback is short, because it is called often."""
+    model, z = measurement.model, measurement.z
+
+    def error(
+        this: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[FloatArray] | None,
+    ) -> FloatArray:
+        x = values.atVector(key)
+        H = model.selection(len(x))
+        if jacobians is not None:
+            jacobians[0] = H
+        if model.angular:
+            return -model.residual(z, H @ x)
+        return np.subtract(H @ x, z)
 
     return gtsam.CustomFactor(noise, [key], error)
 
