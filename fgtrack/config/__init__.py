@@ -1,4 +1,4 @@
-"""The configuration of a run: its sections with their defaults.
+"""The configuration of a run: settings with defaults, YAML files, and shipped configurations.
 
 The names below are public.
 """

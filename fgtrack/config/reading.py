@@ -1,4 +1,4 @@
-"""Reads configurations and scenarios: files, or those that come with the package."""
+"""Reads configurations and scenarios from files; shipped files are read by name."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,8 +26,11 @@ def read_config(
     estimator: str | None = None,
     folder: Path | None = None,
 ) -> Config:
-    """Return the configuration of a file (in `folder`), of that shipped name or of a mapping, else the defaults.
-    `settings` as of `load`; maps and estimator replace those of the file. Raises `CallError` with the key.
+    """Return a configuration: the defaults (None), a `Config`, a mapping, or a file.
+
+    A file is searched in `folder`, else among the shipped names. `settings` as in
+    `load`. Maps and the estimator replace those of the configuration. Raises
+    `CallError` with the key.
     """
     check_paths(map=track_map, pit_map=pit_map)
     if isinstance(name, Mapping):
@@ -40,7 +43,8 @@ def read_config(
         if isinstance(name, Config) and not settings
         else load(Config, name, settings or ())
     )
-    track, pit = track_map or config.map.track, pit_map or config.map.pit
+    track = track_map or config.map.track
+    pit = pit_map or config.map.pit
     road = replace(config.map, track=track and str(track), pit=pit and str(pit))
     return replace(config, map=road, estimator=estimator or config.estimator)
 
@@ -50,20 +54,24 @@ def read_scenario(
     folder: Path | None = None,
     duration_s: float | None = None,
 ) -> "Scenario":
-    """Return the scenario of a file in `folder`, of a shipped name, or of a mapping with the keys of such a file.
+    """Return a scenario: a `Scenario`, a mapping with the keys of a scenario file, or a file.
 
-    `duration_s` replaces its length. Raises as `read_config`.
+    A file is searched in `folder`, else among the shipped names. `duration_s` replaces the
+    duration. Raises as `read_config`.
     """
     from fgtrack.sim.scenario import Scenario
 
     if isinstance(name, Scenario):
-        raw, origin = plain(name), "the given scenario"
+        raw = plain(name)
+        origin = "the given scenario"
     elif isinstance(name, Mapping):
-        raw, origin = dict(name), "the given scenario"
+        raw = dict(name)
+        origin = "the given scenario"
     else:
         check_paths(scenario=name)
         path = find_file("scenario", name, folder)
-        raw, origin = read_yaml(path), str(path)
+        raw = read_yaml(path)
+        origin = str(path)
     return validate(
         Scenario,
         raw if duration_s is None else {**raw, "duration_s": duration_s},

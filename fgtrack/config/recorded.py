@@ -1,4 +1,4 @@
-"""Settings that a recording carries, so that it is replayed as it was made."""
+"""Settings that a recording carries, so that a replay needs no configuration."""
 
 import logging
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordedSensor:
-    """Settings of a sensor by the keys of `sensors.NAME`; None of what is not recorded."""
+    """Recorded settings of a sensor, by the keys of `sensors.NAME`; None if not recorded."""
 
     mount: Mount | None = None
     field_of_view_rad: float | None = None
@@ -35,7 +35,7 @@ class RecordedSensor:
 
 @dataclass(frozen=True)
 class Recorded:
-    """The keys of a configuration that a recording may carry; None of those that it does not."""
+    """Configuration keys that a recording may carry; None if not recorded."""
 
     ego: EgoConfig = field(default_factory=EgoConfig)
     map: MapConfig = field(default_factory=MapConfig)
@@ -46,18 +46,21 @@ _RECORDED = TypeAdapter(Recorded | None, config=ConfigDict(allow_inf_nan=False))
 
 
 def recorded(source: InputSource) -> Recorded:
-    """Return the settings that `source` carries; invalid ones, and a track without its file, are a warning."""
+    """Return the settings that `source` carries.
+
+    Invalid settings, and a map file that does not exist, are ignored with a warning.
+    """
     try:
         result = (
             _RECORDED.validate_python(source.settings(), extra="ignore") or Recorded()
         )
-    except DataError:  # reading the messages reports it
+    except DataError:  # reading the messages reports the error
         return Recorded()
     except ValidationError as error:
         (first, *_) = error.errors(include_url=False)
         where = ".".join(str(part) for part in first["loc"])
         _logger.warning(
-            "%s: the recorded settings are not used, %s: %s",
+            "%s: the recorded settings are ignored, %s: %s",
             source.path,
             where,
             first["msg"],
@@ -66,16 +69,16 @@ def recorded(source: InputSource) -> Recorded:
     track = result.map.track_file
     if track is not None and track != OVAL and not Path(track).is_file():
         _logger.warning(
-            "%s: the recorded map %s is not there, name it by --map", source.path, track
+            "%s: the recorded map %s does not exist, give the map with --map",
+            source.path,
+            track,
         )
         return replace(result, map=MapConfig())
     return result
 
 
-def recorded_of(
-    scenario: "Scenario",
-) -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
-    """Return the settings that a recording of `scenario` carries."""
+def recorded_of(scenario: "Scenario") -> dict[str, Any]:  # Any: plain values
+    """Return the settings that a recording of `scenario` carries, as plain values."""
     sensors = {
         item.name: RecordedSensor(
             None if item.mount == Mount() else item.mount,
@@ -85,8 +88,8 @@ def recorded_of(
         )
         for item in scenario.sensors
     }
-    ego, track = (
-        {"detection_origin_x_m": scenario.detection_origin_x_m},
-        {"track": scenario.map},
-    )
-    return {"ego": ego, "map": track, "sensors": plain(sensors)}
+    return {
+        "ego": {"detection_origin_x_m": scenario.detection_origin_x_m},
+        "map": {"track": scenario.map},
+        "sensors": plain(sensors),
+    }

@@ -1,4 +1,4 @@
-"""The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
+"""The configuration of a run. The defaults are for open space; a YAML file overrides them."""
 
 import math
 from collections.abc import Mapping
@@ -51,73 +51,88 @@ class ClockConfig:
     """Times of the ticks."""
 
     node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
-    """Ticks lie on multiples of the node period; null ticks at every message instead."""
+    """Ticks are at multiples of the node period; null: every message causes a tick."""
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """The map, and how far from it an object may be. A negative buffer keeps away from the wall."""
+    """The map, and the largest distance of objects from it; a negative buffer excludes objects near the wall."""
 
     track: str | None = None
-    """CSV file of the track, `oval` for the built-in one, `none` for open space; null: in a replay that of the
-    recording, else open space."""
+    """CSV file of the track, `oval` for the built-in track, or `none` for open space.
+
+    Null: in a replay the track of the recording, else open space.
+    """
     pit: str | None = None
-    """CSV file of the pit lane, `oval` for the built-in one, or null."""
+    """CSV file of the pit lane, `oval` for the built-in pit lane, or null."""
     inner_buffer_m: float = 0.0
-    """Distance beyond the inner bound at which an object may be."""
+    """Largest distance of an object beyond the inner bound of the track."""
     outer_buffer_m: float = 0.0
-    """The same for the outer bound."""
+    """Largest distance of an object beyond the outer bound of the track."""
     pit_buffer_m: float = 0.0
-    """The same for both bounds of the pit lane."""
+    """Largest distance of an object beyond either bound of the pit lane."""
 
     @property
     def track_file(self) -> str | None:
-        """File of the track; None of open space."""
+        """File of the track; None for open space."""
         return None if self.track == OPEN_SPACE else self.track
 
 
 @settings
 class EgoConfig:
-    """Low-pass of the ego state, its uncertainty, and the origin of detections in the ego frame."""
+    """Low-pass filter of the ego state, its uncertainty, and the origin of detections in the ego frame."""
 
     yaw_weight: _Weight = 1.0
-    """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
+    """Weight of a new yaw in the low-pass filter; 1 means no filtering."""
     yaw_rate_weight: _Weight = 1.0
-    """Weight of the new yaw rate."""
+    """Weight of a new yaw rate in the low-pass filter."""
     detection_origin_x_m: float | None = None
-    """Origin of the detections' ego frame, ahead of the ego reference point; null: in a replay that of the recording,
-    else 0."""
+    """Origin of the ego frame of detections, ahead of the ego reference point.
+
+    Null: in a replay the origin in the recording, else 0.
+    """
     detection_origin_y_m: float = 0.0
-    """The same to the left."""
+    """Origin of the ego frame of detections, to the left of the ego reference point."""
     uncertainty: Literal["none", "independent"] = "independent"
-    """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had
-    an error of its own."""
+    """Use of the ego's covariance: `none` ignores it, as in the paper.
+
+    `independent` adds it to the noise of each detection, as if the ego errors of
+    detections were independent.
+    """
     position_std_m: NonNegativeFloat = 0.0
-    """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
+    """Standard deviation of the ego's x and y, if the recording reports no covariance."""
     position_time_s: PositiveFloat | None = None
-    """Time over which their error wanders, as that of GNSS positions: they are then fused with speed and yaw, by their
-    standard deviations. null: positions as reported, with independent errors."""
+    """Correlation time of the ego's position errors, which drift as those of GNSS positions do.
+
+    Positions are then fused with speed and yaw by their standard deviations. Null:
+    positions are used as reported, with independent errors.
+    """
     yaw_std_rad: NonNegativeFloat = 0.0
-    """The same of its yaw."""
+    """Standard deviation of the ego's yaw, if the recording reports no covariance."""
     speed_std_mps: NonNegativeFloat = 0.0
-    """The same of its speed."""
+    """Standard deviation of the ego's speed, if the recording reports no covariance."""
     yaw_rate_std_radps: NonNegativeFloat = 0.0
-    """The same of its yaw rate."""
+    """Standard deviation of the ego's yaw rate, if the recording reports no covariance."""
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
-    """Longest time for which a list that needs the ego pose waits for an ego state at or after its stamp. The list
-    waits for at most half of the window of the estimator. Then, or with 0 at once, the pose is extrapolated."""
+    """Longest time for which a list that needs the ego's pose waits for an ego state at or after its stamp.
+
+    The list waits for at most half of the estimator's window. Afterwards, or with 0
+    immediately, the pose is extrapolated.
+    """
     accel_std_mps2: PositiveFloat = 1.0
-    """Standard deviation of the ego's acceleration, by which an extrapolated pose grows uncertain, until the ego's
-    states have shown their own."""
+    """Standard deviation of the ego's acceleration, with which the uncertainty of an extrapolated pose grows.
+
+    It is used until the ego's states allow an estimate.
+    """
     yaw_accel_std_radps2: PositiveFloat = 0.1
-    """The same of its yaw acceleration."""
+    """Standard deviation of the ego's yaw acceleration, used as `accel_std_mps2`."""
 
     def __post_init__(self) -> None:
         fused = self.position_time_s is not None
         require(
             not fused or self.uncertainty != "none",
             "uncertainty",
-            "`independent` with position_time_s",
+            "must be `independent` if position_time_s is set",
             "none",
         )
 
@@ -137,15 +152,22 @@ Defect = Literal[
     "refiltered_ego",
     "leading_clock",
 ]
-"""The map look-up of the published implementation with the heading on the circle (Q4) or through its jump (Q3, Q4);
-(std_per_s dt)^2 in every step dt of the filter, whatever its frequency (Q6); a yaw that sticks at its upper limit (Q2);
-an update without delay that does not reach the stored present state (Q8); the newest list of each sensor alone (Q12);
-an ego low-pass that filters its own output at every tick (Q13); a tracking time up to a step ahead of the clock
-(Q14)."""
+"""Defects of the published implementation.
+
+- `heading_jump` (Q3, Q4): the published map look-up from the nearest row, with the heading interpolated as a number,
+  even across its jump at +-pi.
+- `circular_heading` (Q4): the same look-up, with the heading interpolated on the circle.
+- `noise_per_step` (Q6): process noise of (std_per_s dt)^2 in each step dt, so it depends on the filter's frequency.
+- `saturated_yaw` (Q2): the yaw stays at its upper limit.
+- `stale_present` (Q8): an update without delay does not change the stored present state.
+- `one_slot` (Q12): only the newest list of each sensor is used.
+- `refiltered_ego` (Q13): the ego's low-pass filters its own output at every tick.
+- `leading_clock` (Q14): the tracking time is ahead of the clock by up to one step.
+"""
 
 
 def _lifecycle_kind(value: object) -> str:
-    """Which form of `lifecycle` is meant: by existence where it is not specified."""
+    """Tag of the form of `lifecycle`: `existence` unless another kind is given."""
     kind = (
         value.get("kind", "existence")
         if isinstance(value, Mapping)
@@ -168,7 +190,7 @@ class FilterConfig:
     frequency_hz: Annotated[float, Field(ge=1.0, le=10_000.0)] = 100.0
     """Frequency of the grid."""
     storage_s: float = 3.0
-    """Time for which states are kept."""
+    """Time for which the filter keeps states."""
 
     def __post_init__(self) -> None:
         if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
@@ -179,18 +201,22 @@ class FilterConfig:
 
 @settings
 class InitiationConfig:
-    """Start of a track whose direction of travel neither the map nor the sensor gives."""
+    """Start of a track whose heading neither the map nor the sensor reports."""
 
     method: Initiation = DEFAULT
-    """`one-point`: at the first position, heading along x; `two-point`: along the first two; `regression`: along a line
-    through the first ones, until its direction is certain."""
+    """Method by which the first heading is estimated.
+
+    `one-point`: the track starts at the first position, with the heading along x.
+    `two-point`: along the line through the first two positions. `regression`: along a
+    line through the first positions, until the heading is certain.
+    """
 
 
-#: Frequency of the steps to which `motion.std_per_s` belongs, as in the paper.
+#: Frequency of the steps that `motion.std_per_s` refers to, as in the paper.
 NOISE_HZ = 100.0
-#: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
+#: Default for traffic: changes of 1.5 m/s and 0.2 rad/s within a second.
 _STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
-#: Kinds whose noise is always `std_per_s`. Any other kind is the name of a registered motion model.
+#: Kinds whose noise is always `std_per_s`. Another kind is the name of a registered motion model.
 _STANDARD: Mapping[str, type[WhiteNoise]] = {
     "auto": CTRV,
     "ctrv_euler": CTRV,
@@ -201,7 +227,7 @@ _STANDARD: Mapping[str, type[WhiteNoise]] = {
 }
 
 
-#: Names of the noise of `CT` by those of `CTRV`, which `motion.kind: auto` takes.
+#: Names of the noise of `CT` by the names of `CTRV`'s noise, which `motion.kind: auto` expects.
 _OF_CT = {"position": "position", "speed": "velocity", "yaw_rate": "yaw_rate"}
 
 
@@ -211,7 +237,7 @@ def _turns(model: MotionModel) -> bool:
 
 
 def _gives_yaw(sensor: SensorModel) -> bool:
-    """True if detections of `sensor` have a yaw, measured or from the map."""
+    """True if detections of `sensor` have a yaw: measured, or from the map."""
     return "yaw_rad" in sensor.std or sensor.yaw_from_map_std_rad is not None
 
 
@@ -220,43 +246,56 @@ class MotionConfig:
     """Motion model and its process noise."""
 
     kind: str = "auto"
-    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in. `auto` is `ctrv` where a
-    sensor measures the yaw or takes it from the map, else `ct`: the heading of an object at rest is then unknown."""
+    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's Euler steps), or the name of a plug-in.
+
+    `auto` is `ctrv` if a sensor measures the yaw or reads it from the map. Otherwise it
+    is `ct`, because the heading of an object at rest is then unknown.
+    """
     std_per_s: Mapping[str, NonNegativeFloat] = field(default_factory=_STD_PER_S.copy)
-    """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
-    std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `ct` takes `position`, `velocity` and `yaw_rate`, `cv` takes
-    `velocity` alone. `auto` takes those of `ctrv`, and uses `speed` as `velocity` for `ct`. Of `ctrv_euler` `accel` is
-    an acceleration that drives the speed but is never estimated (Q5)."""
+    """Process noise as in the paper: each step of 1 / `NOISE_HZ` adds the variance (std_per_s / NOISE_HZ)^2.
+
+    So the density is std_per_s^2 / NOISE_HZ. `ctrv` has `position`, `yaw`, `speed` and
+    `yaw_rate`; `ctra` also has `accel`; `ct` has `position`, `velocity` and `yaw_rate`;
+    `cv` has `velocity`. `auto` has the names of `ctrv`, and uses `speed` as `velocity`
+    for `ct`. In `ctrv_euler`, `accel` is an acceleration that drives the speed but is
+    never estimated (Q5).
+    """
     yaw_rate_std_radps: PositiveFloat = 0.5
-    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`). A yaw rate that nothing
-    measures relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
+    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`).
+
+    An unmeasured yaw rate relaxes to zero with this uncertainty; `.inf` lets it drift
+    without limit.
+    """
     slow_mps: PositiveFloat = 1.0
-    """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
+    """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show the yaw."""
     resting_yaw_rad2ps: NonNegativeFloat = 6.0
-    """Spectral density of that noise at rest; it falls with the speed v as 1 / (1 + (v / slow_mps)^2)^2."""
+    """Spectral density of this additional noise at rest; at speed v times 1 / (1 + (v / slow_mps)^2)^2."""
     parameters: Mapping[str, float] = field(default_factory=dict)
-    """Keyword parameters of any other registered model. Its noise is that of its own defaults and of these parameters;
-    if `std_per_s` names its densities instead, `fgtrack advise --tune` fits them."""
+    """Keyword parameters of another registered model.
+
+    Its noise results from its defaults and these parameters. If `std_per_s` contains
+    its densities instead, they are fitted by `fgtrack advise --tune`.
+    """
 
     def __post_init__(self) -> None:
         if self.parameters and self.kind in _STANDARD:
             raise ValueError(
-                f"parameters: kind {self.kind} takes none, set std_per_s and the other keys of motion"
+                f"parameters: kind {self.kind} has no parameters, set std_per_s and the other keys of motion"
             )
         self.model()
 
     @property
     def is_driven(self) -> bool:
-        """True if an acceleration drives the speed that is never estimated."""
+        """True if an acceleration that is never estimated drives the speed."""
         return self.kind == "ctrv_euler" and "accel" in self.std_per_s
 
     @property
     def _has_stds(self) -> bool:
-        """True if the noise is `std_per_s`."""
+        """True if `std_per_s` determines the noise."""
         return self.kind in _STANDARD or dict(self.std_per_s) != _STD_PER_S
 
     def _is_cartesian(self, sensors: Mapping[str, SensorModel] | None) -> bool:
-        """True if `auto` is `ct` with `sensors`."""
+        """True if `auto` is `ct` with these `sensors`."""
         return (
             self.kind == "auto"
             and bool(sensors)
@@ -266,7 +305,7 @@ class MotionConfig:
     def noise_names(
         self, sensors: Mapping[str, SensorModel] | None = None
     ) -> tuple[str, ...]:
-        """Names in `std_per_s` that the model has with `sensors`, see `model`."""
+        """Names in `std_per_s` that the model has with these `sensors`; see `model`."""
         if not self._has_stds:
             return ()
         return tuple(
@@ -276,9 +315,9 @@ class MotionConfig:
         )
 
     def model(self, sensors: Mapping[str, SensorModel] | None = None) -> MotionModel:
-        """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it.
+        """Return the motion model with its densities; raises `ValueError` if `std_per_s` does not fit the model.
 
-        `sensors` decide what `auto` is: `ctrv` where there are none.
+        `sensors` determine the meaning of `auto`; without sensors it is `ctrv`.
         """
         if self.kind not in _STANDARD:
             return motion_model(self.kind, {**self._densities(), **self.parameters})
@@ -294,37 +333,39 @@ class MotionConfig:
         return model.from_std_per_step(self.std_per_s, NOISE_HZ, **others)
 
     def _densities(self) -> dict[str, float]:
-        """Densities by `std_per_s` of a model that is registered by the name `kind`; empty where they are not set."""
+        """Densities from `std_per_s` for the registered model `kind`; empty if `std_per_s` is not set."""
         if not self._has_stds:
             return {}
         model = MOTION_MODELS.load(self.kind)
         if not (isinstance(model, type) and issubclass(model, MotionModel)):
-            raise ValueError(f"std_per_s: {self.kind} is a function, set parameters")
+            raise ValueError(
+                f"std_per_s: the model {self.kind} is a function, set parameters instead"
+            )
         return model.densities_of(self.std_per_s, NOISE_HZ)
 
     def _keys_of(self, model: type[WhiteNoise]) -> dict[str, float]:
-        """Parameters of the model that are keys of this section, but for the densities."""
+        """Parameters of the model that are keys of this section, without the densities."""
         keys = ("yaw_rate_std_radps", "slow_mps", "resting_yaw_rad2ps")
         taken = [each.name for each in fields(model)]
         return {key: getattr(self, key) for key in keys if key in taken}
 
 
-#: Estimators that take all settings of `smoother`.
+#: Estimators that use the section `smoother`.
 SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
 
 
 @dataclass(frozen=True)
 class Effective:
-    """Settings that are easily overlooked, as meta.json has them."""
+    """Settings that are easily overlooked, as in meta.json."""
 
     detection_origin_m: tuple[float, float]
-    """Origin of the ego frame of detections, ahead of the ego reference point and to its left."""
+    """Origin of the ego frame of detections: ahead of the ego reference point, and to its left."""
     merge_distance_m: float | None
-    """Up to which distance detections become one; None for no merge."""
+    """Largest distance at which detections are merged; None without merging."""
     lag_key: str
-    """Key of the configuration that sets the length of the window."""
+    """Configuration key of the window's length."""
     lag_s: float
-    """Length of the window."""
+    """Length of the estimator's window."""
     reach_s: float
     """Largest age at which a detection changes a track."""
 
@@ -350,14 +391,14 @@ class Effective:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides a run besides its input."""
+    """All settings that determine a run, apart from its input."""
 
     estimator: str = "ekf-replay"
-    """Name of the estimator of all tracks."""
+    """Name of the estimator for all tracks."""
     sensors: Mapping[str, SensorModel] = field(default_factory=dict)
-    """The sensors by name; where none is named, a replay takes those of the recording, with `ASSUMED_STD`."""
+    """Sensors by name; if empty, a replay uses the sensors of the recording, with `ASSUMED_STD`."""
     ignore_sensors: tuple[str, ...] = ()
-    """Sensors of the input that are left out on purpose, also where they are under `sensors`."""
+    """Sensors of the input that are ignored, even if `sensors` contains them."""
     input: InputConfig = field(default_factory=InputConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     map: MapConfig = field(default_factory=MapConfig)
@@ -372,18 +413,18 @@ class Config:
     smoother: SmootherSettings = field(default_factory=SmootherSettings)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     defects: tuple[Defect, ...] = ()
-    """Defects of the published implementation that change its numbers, see `Defect`."""
+    """Defects of the published implementation that are reproduced, see `Defect`."""
     options: Mapping[str, Mapping[str, bool | int | float | str]] = field(
         default_factory=dict
     )
-    """Options of estimators that have no section of their own, by name: `{reorder-buffer: {hold_s: 0.2}}`."""
+    """Options of estimators without a section of their own, by name: `{reorder-buffer: {hold_s: 0.2}}`."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "estimator", ESTIMATORS.resolve(self.estimator))
         for name in self.options:
             if ESTIMATORS.resolve(name) != name:
                 raise ValueError(
-                    f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}"
+                    f"options: the estimator {name!r} is now named {ESTIMATORS.resolve(name)!r}"
                 )
         for key, named in (
             ("detections", self.input.detections),
@@ -399,7 +440,7 @@ class Config:
             "saturated_yaw",
         } & set(self.defects):
             raise ValueError(
-                "defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler"
+                "defects: noise_per_step and saturated_yaw need motion.kind ctrv_euler"
             )
         for name, sensor in self.sensors.items():
             if sensor.correlation is not None and self.motion.kind == "ctrv_euler":
@@ -414,14 +455,14 @@ class Config:
 
     @classmethod
     def from_yaml(cls, name: str | Path) -> Self:
-        """Return the configuration of a YAML file or of that shipped name. Raises `CallError` with file and key."""
+        """Return the configuration of a YAML file, or of a shipped name; raises `CallError` with file and key."""
         return load(cls, find_file("configuration", name))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, object]) -> Self:
-        """Return the configuration of nested mappings, such as `run.config`; missing keys have their defaults.
+        """Return the configuration of nested mappings, such as `run.config`; missing keys get their defaults.
 
-        Raises `CallError` with the key, and for anything else than a mapping.
+        Raises `CallError` with the key, and for an argument that is no mapping.
         """
         if not isinstance(values, Mapping):
             raise CallError(
@@ -430,13 +471,13 @@ class Config:
         return validate(cls, plain(values), "the given configuration")
 
     def to_yaml(self, path: str | Path) -> None:
-        """Write every key to a YAML file, which is replaced."""
+        """Write every key to a YAML file; an existing file is replaced."""
         Path(path).write_text(dump(self), encoding="utf-8")
 
     def replace(
         self, settings: Mapping[str, object] | None = None, /, **sections: object
     ) -> Self:
-        """Return a copy with other values of dotted keys or of whole sections. Raises `CallError` with the key.
+        """Return a copy with other values of dotted keys, or of whole sections; raises `CallError` with the key.
 
         `config.replace({"smoother.lag_s": 3.0}, estimator="smoother")`
         """
@@ -447,7 +488,7 @@ class Config:
 
     @property
     def used_sensors(self) -> Mapping[str, SensorModel]:
-        """The sensors that are not ignored."""
+        """Sensors that are not ignored."""
         return {
             name: sensor
             for name, sensor in self.sensors.items()
@@ -456,21 +497,21 @@ class Config:
 
     @property
     def effective(self) -> Effective:
-        """Settings that are easily overlooked, as a run has them."""
-        key, lag_s, behind_s = "filter.storage_s", self.filter.storage_s, 0.0
+        """Settings that are easily overlooked, with the values that a run uses."""
+        key = "filter.storage_s"
+        lag_s = self.filter.storage_s
+        behind_s = 0.0
         if self.estimator in SMOOTHERS:
-            key, lag_s, behind_s = (
-                "smoother.lag_s",
-                self.smoother.lag_s,
-                self.smoother.behind_s,
-            )
+            key = "smoother.lag_s"
+            lag_s = self.smoother.lag_s
+            behind_s = self.smoother.behind_s
         distance_m = None if isinstance(self.merge, NoMerge) else self.merge.distance_m
         return Effective(
             self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s
         )
 
     def motion_model(self) -> MotionModel:
-        """The motion model of the tracks, with the errors of sensors that are correlated in time."""
+        """Return the motion model of the tracks, extended by the time-correlated errors of sensors."""
         return with_correlated_errors(
             self.motion.model(self.used_sensors), self.used_sensors
         )

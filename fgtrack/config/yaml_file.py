@@ -1,4 +1,4 @@
-"""YAML files to validated dataclasses and back; every error names the file and the key."""
+"""Reads YAML files into validated dataclasses, and writes them; every error names the file and the key."""
 
 import json
 import re
@@ -21,7 +21,7 @@ from fgtrack.core.yaml_text import safe_yaml
 
 T = TypeVar("T")
 SMALLEST = 1e-12
-"""No configured number but 0 has a smaller magnitude, in any unit: squares and products stay finite."""
+"""Smallest magnitude of a configured number except 0, in any unit, so that squares and products stay finite."""
 _UNKNOWN = "unexpected_keyword_argument"
 
 
@@ -30,14 +30,20 @@ def load(
     path: Path | T | None,
     settings: Sequence[str] | Mapping[str, Any] = (),
 ) -> T:
-    """Return an instance of `kind` from a YAML file, another instance, or the defaults.
-    `settings` are values by dotted key, or texts a.b=value. Raises `CallError` with file and key.
+    """Return an instance of `kind` from a YAML file, from another instance, or with the defaults (None).
+
+    `settings` are values by dotted key, or texts a.b=value. Raises `CallError` with
+    file and key.
     """
-    raw, origin = (
-        ({}, "defaults") if path is None else (plain(path), "the given configuration")
-    )
-    if isinstance(path, Path):
-        raw, origin = read_yaml(path), str(path)
+    if path is None:
+        raw = {}
+        origin = "defaults"
+    elif isinstance(path, Path):
+        raw = read_yaml(path)
+        origin = str(path)
+    else:
+        raw = plain(path)
+        origin = "the given configuration"
     changes = (
         settings
         if isinstance(settings, Mapping)
@@ -49,8 +55,10 @@ def load(
 def with_settings(
     kind: type[T], raw: dict[str, Any], settings: Mapping[str, Any], origin: str
 ) -> T:
-    """Return `raw` as an instance of `kind`, with values of the dotted keys of `settings`.
-    A setting below a key that `raw` leaves out changes that key's default: one sensor of all, the same `kind`.
+    """Return `raw` as an instance of `kind` after setting values by dotted keys.
+
+    A key inside a section that `raw` does not contain changes a value of the section's
+    default: a sensor among all sensors, or a value of the same `kind`.
     """
     if not settings:
         return validate(kind, raw, origin)
@@ -63,10 +71,8 @@ def with_settings(
     return validate(kind, raw, f"{origin} with --set")
 
 
-def read_yaml(
-    path: Path,
-) -> dict[str, Any]:  # Any: what YAML holds is only known after validation
-    """Return the mapping in the YAML 1.2 file `path`, empty for an empty file."""
+def read_yaml(path: Path) -> dict[str, Any]:  # Any: validated later
+    """Return the mapping in the YAML 1.2 file `path`; an empty file gives an empty mapping."""
     try:
         with open_text(path) as file:
             value = _parse(file.read(), str(path))
@@ -75,7 +81,7 @@ def read_yaml(
         raise CallError(f"{path}: configuration cannot be read ({reason})") from error
     if not isinstance(value, dict | None):
         raise CallError(
-            f"{path}: a mapping of keys to values is needed, this is {_short(value)}"
+            f"{path}: must contain a mapping of keys to values, not {_short(value)}"
         )
     return value or {}
 
@@ -84,21 +90,20 @@ def _parse(text: str, origin: str) -> Any:
     try:
         return safe_yaml(text)
     except YAMLError as error:
-        mark, problem = (
-            getattr(error, "problem_mark", None),
-            getattr(error, "problem", None) or str(error),
-        )
-        problem, line = (
-            problem.split("To suppress")[0],
-            "" if mark is None else f":{mark.line + 1}",
-        )
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or str(error)
+        problem = problem.split("To suppress")[0]
+        line = "" if mark is None else f":{mark.line + 1}"
         raise CallError(
             f"{origin}{line}: invalid YAML, {' '.join(problem.split())}"
         ) from error
 
 
 def names_of(key: str) -> list[str]:
-    """Names of the path `key`, else none; one with a dot is in double quotes: `sensors."cam.top".std.x_m`."""
+    """Return the names in the dotted path `key`; empty if it is malformed.
+
+    A name that contains a dot is in double quotes: `sensors."cam.top".std.x_m`.
+    """
     quoted = r'(?:"[^"]+"|[^".]+)'
     if not re.fullmatch(rf"{quoted}(?:\.{quoted})*", key):
         return []
@@ -106,12 +111,12 @@ def names_of(key: str) -> list[str]:
 
 
 def key_and_value(setting: str) -> tuple[str, Any]:
-    """Return key and value of a setting of the form a.b=value. Raises `CallError` for another form."""
+    """Return key and value of a setting `a.b=value`; raises `CallError` for another form."""
     key, equals, text = setting.partition("=")
     if not equals or not names_of(key.strip()):
         raise CallError(
-            f"--set {setting}: write key=value, with dots between the keys of a path and a name that contains a dot "
-            "in double quotes (--set 'sensors.\"cam.top\".std.x_m=1')"
+            f"--set {setting}: must be key=value, with dots between the names of the key; a name that contains a dot "
+            "is in double quotes (--set 'sensors.\"cam.top\".std.x_m=1')"
         )
     return key.strip(), _parse(text, f"--set {setting}")
 
@@ -119,12 +124,16 @@ def key_and_value(setting: str) -> tuple[str, Any]:
 def with_value(
     inside: Any, names: Sequence[str], value: Any, default: object = None
 ) -> Any:
-    """Return a copy of `inside` with `value` at the path `names`, where a list entry has its index or `name`.
-    Of a mapping left out the `default` stays, or its `kind`. Raises `LookupError` for a path into a number or text.
+    """Return a copy of `inside` with `value` at the path `names`.
+
+    An entry of a list is selected by its index or its `name`. A mapping that is missing
+    in `inside` is taken from `default`; a missing dataclass gets the `kind` of
+    `default`. Raises `LookupError` for a path into a number or a text.
     """
     if not names:
         return value
-    first, rest = names[0], names[1:]
+    first = names[0]
+    rest = names[1:]
     if inside is None:
         inside = plain(default) if isinstance(default, Mapping) else {}
         inside |= {"kind": default.kind} if hasattr(default, "kind") else {}
@@ -135,7 +144,7 @@ def with_value(
         ]
         known = known if first in known else [str(k) for k in range(len(inside))]
         if first not in known:
-            raise LookupError(f"there is no {first!r} among {len(inside)} entries")
+            raise LookupError(f"there is no entry {first!r} among {len(inside)}")
         index = known.index(first)
         return [
             *inside[:index],
@@ -143,7 +152,7 @@ def with_value(
             *inside[index + 1 :],
         ]
     if not isinstance(inside, Mapping):
-        raise LookupError(f"there is no {first!r} in {_short(inside)}, a single value")
+        raise LookupError(f"there is no key {first!r} in the value {_short(inside)}")
     return {
         **inside,
         first: with_value(
@@ -153,7 +162,7 @@ def with_value(
 
 
 def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
-    """Return `raw` as an instance of the dataclass `kind`; `origin` is named in errors."""
+    """Return `raw` as an instance of the dataclass `kind`; raises `CallError` with `origin` and the key."""
     try:
         text = json.dumps(raw, default=_number)
     except (TypeError, ValueError) as error:
@@ -170,20 +179,20 @@ def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
             and scalar
             and not SMALLEST <= abs(scalar) <= LARGEST
         ):
-            needed = f"a magnitude of {SMALLEST:g} to {LARGEST:g}, or 0"
             raise CallError(
-                f"{origin}: {where}: {needed} is needed, not {_short(scalar)}"
+                f"{origin}: {where}: must be 0, or have a magnitude of {SMALLEST:g} to {LARGEST:g}, "
+                f"not {_short(scalar)}"
             )
     return value
 
 
 def texts_of(value: object) -> Iterator[str]:
-    """Yield every text in plain `value`, keys too."""
+    """Yield every text in plain `value`, including keys."""
     return (scalar for _, scalar in _scalars(value, "") if isinstance(scalar, str))
 
 
 def _scalars(value: object, where: str) -> Iterator[tuple[str, float | str]]:
-    """Yield every number and text in plain `value`, keys too, with its path."""
+    """Yield every number and text in plain `value`, including keys, with its path."""
     if isinstance(value, float | int | str):
         yield where, value
     elif isinstance(value, (dict, list)):
@@ -195,14 +204,9 @@ def _scalars(value: object, where: str) -> Iterator[tuple[str, float | str]]:
 
 
 @lru_cache
-def _adapter(
-    kind: Any,
-) -> TypeAdapter[
-    Any
-]:  # Any: one for each dataclass, which takes pydantic a while to make
-    return TypeAdapter(
-        kind | None, config=ConfigDict(allow_inf_nan=False)
-    )  # a class by itself takes no `config`
+def _adapter(kind: Any) -> TypeAdapter[Any]:  # Any: any dataclass
+    # Cached, because pydantic takes long to create an adapter. `config` is not allowed for a class without `| None`.
+    return TypeAdapter(kind | None, config=ConfigDict(allow_inf_nan=False))
 
 
 def _number(value: object) -> object:
@@ -212,33 +216,31 @@ def _number(value: object) -> object:
 
 
 def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
-    """Return a line on the first complaint of pydantic, on an unknown key where there is one."""
+    """Return a line on the first error of pydantic; an unknown key takes precedence."""
     details = error.errors(include_url=False)
     first = next((item for item in details if item["type"] == _UNKNOWN), details[0])
-    names, inside = list[str](), json.loads(text)
+    names = list[str]()
+    inside = json.loads(text)
     part: Any
-    for part in first["loc"]:  # tags of unions are not written in the file
+    for part in first["loc"]:  # the file does not contain tags of unions
         is_entry = (
             isinstance(inside, list) and isinstance(part, int) and part < len(inside)
         )
         if is_entry or (isinstance(inside, Mapping) and part in inside):
             names, inside = [*names, str(part)], inside[part]
-    message, given = (
-        first["msg"].removeprefix("Value error, "),
-        f", not {_short(first['input'])}",
-    )
+    message = first["msg"].removeprefix("Value error, ")
+    given = f", not {_short(first['input'])}"
     if first["type"] == _UNKNOWN:
         known = _known_keys(kind, text, names[:-1])
         hint = did_you_mean(names[-1], known).removesuffix("?")
-        message, given = (
-            f"unknown key{hint}"
-            + (f", known here: {', '.join(known)}" if known else ""),
-            "",
-        )
+        listed = f"; the keys are {', '.join(known)}" if known else ""
+        message = f"unknown key{hint}{listed}"
+        given = ""
     elif first["type"] == "missing":
-        names, given = [*names, str(first["loc"][-1])], ""
+        names.append(str(first["loc"][-1]))
+        given = ""
     elif first["type"] == "union_tag_not_found":
-        message = "needs the key `kind`, which selects its form"
+        message = "the key `kind` is missing, which selects the form"
     elif first["type"] == "union_tag_invalid":
         given += did_you_mean(
             first["ctx"]["tag"],
@@ -251,7 +253,7 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
 
 
 def _known_keys(kind: type[Any], text: str, names: Sequence[str]) -> list[str]:
-    """Return the keys at the path `names`; none where the rest is wrong as well."""
+    """Return the keys at the path `names`; empty if the rest of the document is invalid too."""
     try:
         inside = plain(_adapter(kind).validate_json(text, strict=True, extra="ignore"))  # type: ignore[arg-type]  # as above
     except ValidationError:
@@ -267,7 +269,7 @@ def _short(value: object) -> str:
 
 
 def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them
-    """A dataclass as mappings, lists and scalars, every key written out; `validate` reads it back to an equal value."""
+    """Return a dataclass as mappings, lists and scalars, with every key; `validate` converts them back."""
     if is_dataclass(value):
         return {
             field.name: plain(getattr(value, field.name)) for field in fields(value)
@@ -280,7 +282,7 @@ def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them
 
 
 def dump(value: object) -> str:
-    """YAML text of a dataclass, every key written out; `validate` reads it back to an equal value."""
+    """Return the YAML text of a dataclass, with every key; `validate` reads it back to an equal value."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares it as None

@@ -102,7 +102,7 @@ def validated_message(message: Message) -> Message:
 
 def validated_head(message: _Message) -> _Message:
     """Return `message` with plain values in all fields except `objects`; raises `InvalidMessageError`."""
-    message = _plain(message)
+    message = _with_plain_values(message)
     if not is_stamp(message.receipt_ns):  # ages of messages are computed from it
         raise _invalid(
             "receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns
@@ -128,7 +128,7 @@ def validated_detection(item: Detection) -> Detection:
     """
     if not isinstance(item, Detection):
         raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
-    item = _plain(item)
+    item = _with_plain_values(item)
     undefined = dict[str, None]()
     for name in _NUMBERS:
         value = getattr(item, name)
@@ -137,7 +137,7 @@ def validated_detection(item: Detection) -> Detection:
     return replace(item, **undefined) if undefined else item
 
 
-def _plain(item: _Item) -> _Item:
+def _with_plain_values(item: _Item) -> _Item:
     """Return `item` with plain values; the same object if all are plain. Raises `InvalidMessageError`."""
     changed = dict[str, Any]()
     for name, (convert, expected), is_optional in _FIELDS[type(item)]:

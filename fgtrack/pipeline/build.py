@@ -1,4 +1,4 @@
-"""From a configuration to a tracker."""
+"""Builds a tracker and its parts from a configuration."""
 
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -46,19 +46,18 @@ from fgtrack.tracking.lives.latency import Watermarks
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
-_EGO_STORAGE_TICKS = 350  # of the published implementation
+#: Stored ego states of the published implementation.
+_EGO_STORAGE_TICKS = 350
 
 
 def build_tracker(
     config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None
 ) -> Tracker:
-    """Return the tracker that `config` describes, of the parts that `observed` returns for the usual ones."""
+    """Return the tracker that `config` describes; `observed` may replace its parts."""
     road = build_road(config.map, config.defects)
-    motion, lifecycle, failures = (
-        config.motion_model(),
-        build_lifecycle(config),
-        Failures(),
-    )
+    motion = config.motion_model()
+    lifecycle = build_lifecycle(config)
+    failures = Failures()
     published_order = config.lifecycle.kind == "published"
     joint = (
         config.association if isinstance(config.association, GatedMahalanobis) else None
@@ -97,7 +96,7 @@ def build_tracker(
 
 
 def build_lifecycle(config: Config) -> Lifecycle:
-    """Return the rules that confirm and end tracks."""
+    """Return the lifecycle, which confirms and ends tracks."""
     rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
         return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)
@@ -106,12 +105,12 @@ def build_lifecycle(config: Config) -> Lifecycle:
 
 
 def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:
-    """Return the map that `config` names. Raises `CallError` for a missing file and a pit lane without a track."""
+    """Return the map; raises `CallError` for a missing file, and for a pit lane without a track."""
     if config.track_file is None:
         if config.pit is None:
             return Road()
         raise CallError(
-            f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
+            f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map as well"
         )
     track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
@@ -136,10 +135,8 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
 
 def _build_backward_forward(config: Config) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
-    leads, is_stale = (
-        "leading_clock" in config.defects,
-        "stale_present" in config.defects,
-    )
+    leads = "leading_clock" in config.defects
+    is_stale = "stale_present" in config.defects
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
 
     def bank() -> TrackBank:
@@ -152,9 +149,8 @@ def _build_backward_forward(config: Config) -> TrackBank:
 
     if config.map.track_file is not None or leads or is_stale:
         return bank()
-    motion = (
-        config.motion_model()
-    )  # without a map a track may begin in any direction, each at its own time
+    # Without a map, each track is initiated separately, because its heading is unknown at first.
+    motion = config.motion_model()
 
     def one(start: Start) -> Estimator:
         return initiated(
@@ -168,17 +164,18 @@ def _build_backward_forward(config: Config) -> TrackBank:
 
 
 def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
-    """Return the estimators of all objects, which add to `failures`. Raises `CallError` for invalid options."""
-    name, given = config.estimator, config.options.get(config.estimator, {})
+    """Return the estimators of all objects, which count into `failures`; raises `CallError` for invalid options."""
+    name = config.estimator
+    given = config.options.get(name, {})
     is_filter = name == "ekf-backward-forward"
     if given and (is_filter or name in SMOOTHERS):
-        raise CallError(f"options.{name}: set the keys of smoother or filter instead")
+        raise CallError(
+            f"options.{name}: this estimator has no options, set the keys of smoother or filter instead"
+        )
     if is_filter:
         return _build_backward_forward(config)
-    options: dict[str, Any] = {
-        "initiation": config.initiation.method,
-        **given,
-    }  # Any: of the estimator's own
+    # Any: options of a plug-in have any type.
+    options: dict[str, Any] = {"initiation": config.initiation.method, **given}
     if name in SMOOTHERS:
         options |= {**vars(config.smoother), "failures": failures}
         del options["lag_s"]
@@ -186,8 +183,9 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
 
 
 def build_propagator(config: Config, step_s: float) -> ExactPropagator:
-    """Return the motion model in steps of `step_s`."""
-    motion, noise = config.motion_model(), config.motion
+    """Return the propagator of the backward-forward EKF, with steps of `step_s`."""
+    motion = config.motion_model()
+    noise = config.motion
     if noise.kind != "ctrv_euler":
         return ExactPropagator(motion)
     names = [
@@ -216,7 +214,8 @@ def _build_ego(config: Config) -> EgoTrajectory:
         return PublishedEgo(
             ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known
         )
-    noise = {"speed": 15.0, **config.motion.std_per_s}  # of a plug-in as of traffic
+    # A plug-in's noise may lack `speed`; the default for traffic is used then.
+    noise = {"speed": 15.0, **config.motion.std_per_s}
     density_m2ps3 = noise.get("velocity", noise["speed"]) ** 2 / NOISE_HZ
     growth = (
         None
@@ -234,7 +233,7 @@ def _build_ego(config: Config) -> EgoTrajectory:
 
 
 def _build_wait(config: Config, ego: EgoTrajectory) -> PoseWait | None:
-    """Return what decides which lists wait for an ego message; None where none waits."""
+    """Return the rule for lists that wait for an ego message; None if no list waits."""
     if not config.ego.wait_s:
         return None
     most_age_ns = nanoseconds(0.5 * config.effective.reach_s)

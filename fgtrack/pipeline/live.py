@@ -1,4 +1,4 @@
-"""The tracker in a running system: messages in as they arrive, tracks out at any time."""
+"""The tracker for a running system: messages are received as they arrive, and tracks are available at any time."""
 
 import threading
 from collections import Counter, deque
@@ -41,28 +41,28 @@ if TYPE_CHECKING:
 
 __all__ = ["Lateness", "TickTiming", "Tracker"]
 
-#: Number of sensors without a model that are counted by name; all further ones are counted as `OTHERS`.
+#: Number of unknown sensors that are counted by name; further unknown sensors are counted as `OTHERS`.
 MOST_UNKNOWN = 100
 OTHERS = "other sensors"
-#: A receipt that is further ahead of the tick is of a wrong clock; from a smaller error the tracker recovers by itself,
-#: when the time has come.
+#: Largest lead of a receipt before the tick; a larger lead comes from a wrong clock. After a smaller lead the tracker
+#: recovers by itself when the clock reaches the receipt.
 MOST_AHEAD_NS = 60 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """Delays of the newest 1,000 messages of a sensor, or of the ego: receipt minus the oldest stamp of the message."""
+    """Delays of the newest 1,000 messages of a sensor or of the ego: receipt minus the oldest stamp in the message."""
 
     messages: int
-    """All that were received."""
+    """Number of all received messages."""
     delay_median_s: float | None
-    """None before the first message."""
+    """Median delay; None before the first message."""
     delay_p99_s: float | None
-    """99th percentile."""
+    """99th percentile of the delay."""
     delay_worst_s: float | None
-    """Longest."""
+    """Longest delay."""
     silent_s: float
-    """From the newest receipt (or the first tick, where there was none) to the last tick."""
+    """Time from the newest receipt, or from the first tick before any receipt, to the last tick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +70,23 @@ class TickTiming:
     """Durations of the newest 1,000 ticks, and missed deadlines."""
 
     ticks: int
-    """All."""
+    """Number of all ticks."""
     median_s: float | None
-    """None before the first tick."""
+    """Median duration; None before the first tick."""
     p99_s: float | None
-    """99th percentile."""
+    """99th percentile of the duration."""
     worst_s: float | None
-    """Longest."""
+    """Longest duration."""
     deadline_misses: int
-    """Ticks that were not done when the next one was due, as in a replay; 0 where there is no `clock.node_hz`."""
+    """Ticks that were not finished when the next tick was due, as in a replay; 0 without `clock.node_hz`."""
     skipped: int
-    """Periods of the node in which the host called no tick."""
+    """Node periods in which the host called no tick."""
 
 
 def _spread_s(
     newest_ns: Sequence[int],
 ) -> tuple[float | None, float | None, float | None]:
-    """Return median, 99th percentile, maximum; None where there is no duration."""
+    """Return median, 99th percentile and maximum in s; None for each if there are no durations."""
     if not newest_ns:
         return None, None, None
     median_s, p99_s, worst_s = (
@@ -96,22 +96,25 @@ def _spread_s(
 
 
 class Tracker:
-    """Tracks objects from object lists that arrive late, in a running system.
+    """Tracks objects in a running system, from object lists that may arrive late.
 
-    `receive` takes messages in the order of their arrival, `tick` processes those since the last one. Messages that
-    cannot be used are counted in `refused`, and every detection ends in exactly one disposition of `counts`. An
-    exception of an estimator ends or reinitialises its track, counted in `failures`. A tick that is interrupted, or
-    that has not enough memory to publish, raises; the next one goes on, and no detection is lost.
+    `receive` accepts messages in the order of their arrival; `tick` processes the
+    messages since the last tick. Messages that cannot be used are counted in `refused`.
+    Every detection ends in exactly one disposition in `counts`. An exception in an
+    estimator ends or reinitialises its track, and is counted in `failures`. A tick that
+    is interrupted, or that has too little memory to publish, raises; the next tick
+    continues, and no detection is lost.
 
-    `receive` may be called by any thread and never waits; other calls, by any thread as well, take turns.
+    Any thread may call `receive`, which never waits. Other methods may be called by any
+    thread too, and run one at a time.
 
     Parameters
     ----------
     config
-        Name of a shipped configuration, path of a YAML file, a `Config` or a mapping as `run.config`; None for the
-        defaults.
+        Name of a shipped configuration, path of a YAML file, a `Config`, or a mapping such as `run.config`. None stands
+        for the defaults.
     map, pit_map, estimator, set
-        As of `fgtrack.replay`.
+        As in `fgtrack.replay`.
     """
 
     def __init__(
@@ -133,23 +136,21 @@ class Tracker:
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
-        self._uncounted: TickReport | None = None  # of a tick that was interrupted
+        self._uncounted: TickReport | None = None  # report of an interrupted tick
         self._counts: dict[str, Counter[str]] = {}
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
         self._arrivals: deque[EgoState | DetectionList] = deque()
-        self._ready: deque[EgoState | DetectionList] = (
-            deque()
-        )  # checked, for the next tick
+        # Validated messages for the next tick.
+        self._ready: deque[EgoState | DetectionList] = deque()
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
         self._node = Node(
             None if config.clock.node_hz is None else period_ns(config.clock.node_hz)
         )
         self._skipped = 0
         self._warnings: dict[str, str] = {}  # by sensor
-        self._placed: dict[
-            str, None
-        ] = {}  # sensors with lists in the frame of the ego or their own
+        # Sensors whose lists need the pose of the ego.
+        self._need_ego: dict[str, None] = {}
         self._turn = threading.RLock()
 
     @classmethod
@@ -167,20 +168,20 @@ class Tracker:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Messages and ticks that were not used, by reason."""
+        """Numbers of messages and ticks that were not used, by reason."""
         with self._turn:
             self._take_arrivals()
             return self._refused + self._tracker.refused_ego
 
     @property
     def counts(self) -> Mapping[str, Mapping[str, int]]:
-        """Number of detections by sensor and disposition, of all ticks so far."""
+        """Numbers of detections of all ticks, by sensor and disposition."""
         with self._turn:
             return {sensor: dict(counts) for sensor, counts in self._counts.items()}
 
     @property
     def yaws(self) -> Mapping[str, Mapping[str, int]]:
-        """Numbers by sensor: `yaws` of tracks, `flipped` ones by half a turn, and `unused` ones that misfit."""
+        """Numbers of yaws by sensor: `yaws` of tracks, `flipped` by half a turn, and `unused` because they misfit."""
         with self._turn:
             return {
                 sensor: dict(counts) for sensor, counts in self._tracker.yaws.items()
@@ -188,7 +189,7 @@ class Tracker:
 
     @property
     def failures(self) -> Mapping[str, int]:
-        """Number of failures inside, and of their consequences; see `Failure` for the kinds."""
+        """Numbers of internal failures and of their consequences, by the kinds of `Failure`."""
         with self._turn:
             return {
                 failure.value: count
@@ -197,12 +198,12 @@ class Tracker:
 
     @property
     def last_failure(self) -> str | None:
-        """Traceback of the newest failure inside, to report it."""
+        """Traceback of the newest internal failure, for a bug report."""
         return self._tracker.failures.last
 
     @property
     def lateness(self) -> Mapping[str, Lateness]:
-        """Delays of messages by sensor, and under `ego` for the ego, as of the last tick."""
+        """Delays of messages by sensor, and under `ego` for the ego, up to the last tick."""
         with self._turn:
             self._take_arrivals()
             result = {}
@@ -220,9 +221,10 @@ class Tracker:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines on sensors whose lists come later than the configuration allows, each once, with the key to set.
+        """Warnings about sensors whose lists arrive later than the configuration allows, with the key to set.
 
-        Another line names an ego whose states are later than the lists that need them.
+        Each sensor has one warning. Another warning reports that the ego's states
+        arrive later than lists that need them.
         """
         with self._turn:
             self._take_arrivals()
@@ -240,22 +242,22 @@ class Tracker:
             return *self._warnings.values(), *self._late_ego()
 
     def _late_ego(self) -> Iterator[str]:
-        """Yield the line on an ego that is late by the newest messages."""
+        """Yield the warning about a late ego, from the newest messages."""
         delays_s = {
             name: _spread_s(self._tracker.delays[name].newest_ns)[0]
-            for name in (EGO, *self._placed)
+            for name in (EGO, *self._need_ego)
         }
-        known_s = {
+        medians_s = {
             name: delay_s for name, delay_s in delays_s.items() if delay_s is not None
         }
-        ego_s = known_s.pop(EGO, None)
-        late = None if ego_s is None else late_ego(ego_s, known_s)
+        ego_s = medians_s.pop(EGO, None)
+        late = None if ego_s is None else late_ego(ego_s, medians_s)
         if late is not None:
             yield str(late)
 
     @property
     def timing(self) -> TickTiming:
-        """Durations and missed deadlines of ticks."""
+        """Durations of ticks, and missed deadlines."""
         with self._turn:
             return TickTiming(
                 self._last.tick + 1,
@@ -265,16 +267,19 @@ class Tracker:
             )
 
     def receive(self, message: EgoState | DetectionList) -> None:
-        """Take a message in the order of arrival; detections of an unknown sensor are `invalid` at the next tick.
+        """Accept a message; messages must be passed in the order of their arrival.
 
-        A receipt that lies more than a minute ahead of that tick is replaced by its time.
+        Detections of an unknown sensor become `invalid` at the next tick. A receipt
+        more than a minute ahead of this tick is replaced by the time of the tick.
         """
         self._arrivals.append(message)
 
     def _take_arrivals(self) -> None:
-        """Check all received messages, and keep those that can be used for the next tick."""
-        for _ in range(len(self._arrivals)):  # messages that come meanwhile may wait
-            message = self._arrivals[0]  # it stays there if an interrupt comes
+        """Validate all received messages, and keep the valid ones for the next tick."""
+        for _ in range(len(self._arrivals)):  # messages that arrive meanwhile may wait
+            message = self._arrivals[
+                0
+            ]  # removed below, so an interrupt does not lose it
             try:
                 self._take(message)
             except InvalidMessageError as error:
@@ -289,7 +294,7 @@ class Tracker:
             self._arrivals.popleft()
 
     def _refuse(self, message: EgoState | DetectionList, reason: str) -> None:
-        """Count a message that is not used, and its detections as invalid."""
+        """Count a message that is not used, and record its detections as invalid."""
         self._refused[reason] += 1
         if isinstance(message, DetectionList):
             sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
@@ -305,37 +310,39 @@ class Tracker:
             self._refused["neither ego state nor object list"] += 1
             return
         message = validated_head(message)
-        for what in ("stamp_ns", "receipt_ns"):
-            if not 0 <= getattr(message, what) <= LARGEST_NS:
-                raise InvalidMessageError(f"{what}: nanoseconds since 1970 expected")
+        for name in ("stamp_ns", "receipt_ns"):
+            if not 0 <= getattr(message, name) <= LARGEST_NS:
+                raise InvalidMessageError(f"{name}: nanoseconds since 1970 expected")
         if isinstance(message, DetectionList):
-            name = message.sensor
-            if name not in self.config.sensors:
-                if name not in self.config.ignore_sensors:
+            sensor = message.sensor
+            if sensor not in self.config.sensors:
+                if sensor not in self.config.ignore_sensors:
                     self._refuse(
-                        message, f"sensor {self._counted(name)!r} has no model"
+                        message,
+                        f"sensor {self._name_for_counts(sensor)!r} has no model",
                     )
                 return
             message = replace(
-                message, objects=tuple(map(self._usable, message.objects))
+                message, objects=tuple(map(self._validated, message.objects))
             )
         self._ready.append(message)
 
     def _deliver(self, now_ns: int) -> None:
-        """Give the tracker all messages that can be used. None was received after the tick at `now_ns`.
+        """Pass all valid messages to the tracker; none may be received after the tick at `now_ns`.
 
-        A receipt far ahead of the tick is of a wrong clock. The tick is taken instead: else the message would pass for
-        a recent one, and those that come later for old ones, until the clock has caught up.
+        A receipt far ahead of the tick comes from a wrong clock, and is replaced by the
+        time of the tick. Otherwise this message would count as recent, and later
+        messages as old, until the clock reaches the receipt.
         """
         while self._ready:
-            message = self._ready[0]  # it stays there if an interrupt comes
+            message = self._ready[0]  # removed below, so an interrupt does not lose it
             if message.receipt_ns - now_ns > MOST_AHEAD_NS:
                 message = replace(message, receipt_ns=now_ns)
             try:
                 if isinstance(message, DetectionList):
                     message = corrected(message, self.config.sensors)
                     if message.frame != "map":
-                        self._placed[message.sensor] = None
+                        self._need_ego[message.sensor] = None
                 self._tracker.receive(message)
             except Exception as error:
                 self._refuse(
@@ -343,8 +350,8 @@ class Tracker:
                 )
             self._ready.popleft()
 
-    def _counted(self, sensor: str) -> str:
-        """Return the name under which a sensor is counted: of the unknown ones, the first have their own."""
+    def _name_for_counts(self, sensor: str) -> str:
+        """Return the name under which a sensor is counted: unknown sensors beyond the first 100 share a name."""
         if sensor in self.config.sensors or sensor in self._unknown:
             return sensor
         if len(self._unknown) == MOST_UNKNOWN:
@@ -352,8 +359,8 @@ class Tracker:
         self._unknown[sensor] = None
         return sensor
 
-    def _usable(self, item: Detection) -> Detection:
-        """Return `item` with plain values; an invalid one for wrong types."""
+    def _validated(self, item: Detection) -> Detection:
+        """Return `item` with plain values; a detection without values if it has wrong types."""
         try:
             return validated_detection(item)
         except InvalidMessageError as error:
@@ -361,8 +368,10 @@ class Tracker:
             return Detection()
 
     def tick(self, now_ns: int) -> TickReport:
-        """Process everything received, and bring all tracks to `now_ns`. Raises `CallError` for an invalid time.
-        A tick before the last one is refused: it gives the tracks of that one, and messages wait for the next.
+        """Process all received messages, and predict all tracks to `now_ns`; raises `CallError` for an invalid time.
+
+        A tick before the last tick is refused: it returns the tracks of the last tick,
+        and messages wait for the next tick.
         """
         now_ns = _stamp("now_ns", now_ns)
         with self._turn:
@@ -379,8 +388,12 @@ class Tracker:
             counts = Counter(
                 (update.sensor, str(update.disposition)) for update in report.updates
             )
-            # One statement, so that an interrupt comes before or after it.
-            self._counts, self._records, self._uncounted = self._with(counts), [], None
+            # A single statement, so that an interrupt comes before or after it.
+            self._counts, self._records, self._uncounted = (
+                self._counts_plus(counts),
+                [],
+                None,
+            )
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
             if self._last.tick < 0:
@@ -393,65 +406,71 @@ class Tracker:
             return report
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
-        """Return a track at any stamp in or after its window; ahead of the last tick it is predicted.
+        """Return the state of a track at any stamp in or after its window; it is predicted beyond the last tick.
 
-        Raises `CallError` for a track that does not exist, a stamp before its window and an invalid one.
+        Raises `CallError` for an unknown track, a stamp before its window, and an
+        invalid stamp.
         """
-        track_id, stamp_ns = _track_id(track_id), _stamp("stamp_ns", stamp_ns)
+        track_id = _track_id(track_id)
+        stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.state_at(track_id, stamp_ns)
 
     def window(self, track_id: int) -> "Window":
-        """Return a copy of the window of a track: states, prior and measurements, also as a graph of gtsam.
+        """Return a copy of a track's window: states, prior and measurements, which can be converted to a gtsam graph.
 
-        Raises `CallError` for a track that does not exist, and unless the estimator is a smoother.
+        Raises `CallError` for an unknown track, and if the estimator is no smoother.
         """
         track_id = _track_id(track_id)
         with self._turn:
             return self._tracker.window(track_id)
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
-        """Return all tracks whose window reaches back to the stamp, as `state_at` gives them."""
+        """Return the states at `stamp_ns` of all tracks whose window reaches back to this stamp, as `state_at`."""
         stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.tracks_at(stamp_ns)
 
     def finish(self) -> tuple[SmoothedReport, ...]:
-        """End all tracks; return the smoothed states that were still inside a window.
+        """End all tracks, and return the smoothed states that were still inside a window.
 
-        Lists that still wait for an ego message are processed first, and `counts` has their detections.
+        Lists that wait for an ego message are processed first, and `counts` contains
+        their detections.
         """
         with self._turn:
             final = self._tracker.finish()
             updates = self._tracker.last_updates
-            self._counts = self._with(
+            self._counts = self._counts_plus(
                 Counter((update.sensor, str(update.disposition)) for update in updates)
             )
             return final
 
-    def _with(self, counts: Mapping[tuple[str, str], int]) -> dict[str, Counter[str]]:
-        """Return the numbers of detections by sensor and disposition with the `counts` of a tick."""
-        result = {sensor: own.copy() for sensor, own in self._counts.items()}
+    def _counts_plus(
+        self, counts: Mapping[tuple[str, str], int]
+    ) -> dict[str, Counter[str]]:
+        """Return the numbers of detections by sensor and disposition, including the new `counts`."""
+        result = {sensor: counter.copy() for sensor, counter in self._counts.items()}
         for (sensor, disposition), count in counts.items():
-            result.setdefault(self._counted(sensor), Counter())[disposition] += count
+            name = self._name_for_counts(sensor)
+            result.setdefault(name, Counter())[disposition] += count
         return result
 
 
 def _rule(error: InvalidMessageError) -> str:
-    """Return what was expected; the value is left out, because every value would be a reason of its own."""
+    """Return the expected value in the message of `error`, without the given value, so that reasons can be counted."""
     return str(error).partition(", not ")[0]
 
 
 def _recorded_ns(value: object) -> int:
-    """Return a time of a refused message for its records; 0 where it is not an integer."""
+    """Return a time of a refused message for its records; 0 if it is not an integer."""
     try:
-        return integer(value)  # type: ignore[arg-type]  # whatever was received
+        return integer(value)  # type: ignore[arg-type]  # any received object
     except Exception:
         return 0
 
 
 def _track_id(value: int) -> int:
-    """Return `value` as an integer. Raises `CallError` for other types."""
+    """Return `value` as an integer; raises `CallError` for another type."""
     try:
         return integer(value)
     except TypeError as error:
@@ -459,7 +478,7 @@ def _track_id(value: int) -> int:
 
 
 def _stamp(name: str, value: int) -> int:
-    """Return `value` as an integer. Raises `CallError` for an invalid time."""
+    """Return `value` as an integer; raises `CallError` for an invalid time."""
     try:
         stamp_ns = -1 if isinstance(value, bool | np.bool_) else integer(value)
     except TypeError:

@@ -157,7 +157,7 @@ def test_what_is_lost_is_said(fgtrack: Command) -> None:
     [
         (
             "radar: {dely: {kind: none}}",
-            "bad.yaml: radar.dely: unknown key, did you mean 'delay', known here: delay, clock",
+            "bad.yaml: radar.dely: unknown key, did you mean 'delay'; the keys are delay, clock",
         ),
         (
             "sonar: {delay: {kind: none}}",

@@ -216,15 +216,15 @@ def test_a_key_that_the_user_has_set_wins_also_where_it_is_set_to_its_default(
     [
         (
             {"ego": {"detection_origin_x_m": "far"}},
-            "the recorded settings are not used, ego.detection_origin_x_m",
+            "the recorded settings are ignored, ego.detection_origin_x_m",
         ),
         (
             {"sensors": {"lidar": {"mount": 3}}},
-            "the recorded settings are not used, sensors.lidar.mount",
+            "the recorded settings are ignored, sensors.lidar.mount",
         ),
         (
             {"map": {"track": "gone.csv"}},
-            "the recorded map gone.csv is not there, name it by --map",
+            "the recorded map gone.csv does not exist, give the map with --map",
         ),
         ({"by another program": [1]}, None),
     ],

@@ -107,7 +107,9 @@ def test_an_estimator_gets_its_options_and_refuses_others() -> None:
         CallError, match=r"reorder-buffer: .*'hold'; its options are hold_s"
     ):
         build_bank(load(Config, None, [name, "options.reorder-buffer={hold: 0.2}"]))
-    with pytest.raises(CallError, match=r"options\.smoother: set the keys of smoother"):
+    with pytest.raises(
+        CallError, match=r"options\.smoother: .*set the keys of smoother"
+    ):
         build_bank(
             load(Config, None, ["estimator=smoother", "options.smoother={late: drop}"])
         )
@@ -120,7 +122,9 @@ def test_a_former_name_is_replaced_and_the_warning_names_both_methods(
     [line] = caplog.messages
     assert "now named 'rewind-forget'" in line
     assert "Karle et al. 2023, on a grid of 10 ms, is 'ekf-backward-forward'" in line
-    with pytest.raises(CallError, match="'backward-forward' is now 'rewind-forget'"):
+    with pytest.raises(
+        CallError, match="'backward-forward' is now named 'rewind-forget'"
+    ):
         load(Config, None, ["options={backward-forward: {}}"])
 
 
@@ -168,7 +172,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
     [
         (
             "filtre: {}\n",
-            "config.yaml: filtre: unknown key, did you mean 'filter', known here: estimator, sensors",
+            "config.yaml: filtre: unknown key, did you mean 'filter'; the keys are estimator, sensors",
         ),
         (
             "filter: {frequence: 3.0}\n",
@@ -196,7 +200,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
         ("map: {inner_buffer_m: .inf}\n", "map.inner_buffer_m"),
         ("ego: {yaw_weight: 0.0}\n", "ego.yaw_weight: Input should be greater than 0"),
         ("inbox: {max_future_s: 2.0}\n", "inbox: unknown key"),
-        ("association: {gate_m: 3.0}\n", "association: needs the key `kind`"),
+        ("association: {gate_m: 3.0}\n", "association: the key `kind` is missing"),
         (
             "association: {kind: mahalanobis, gate_m: 3.0}\n",
             "association.gate_m: unknown key",
@@ -208,7 +212,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
         ("motion: {kind: cv}\n", "std of CV: give velocity"),
         (
             "defects: [saturated_yaw]\n",
-            "defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler",
+            "defects: noise_per_step and saturated_yaw need motion.kind ctrv_euler",
         ),
         ("lifecycle: {counter_cap: 0}\n", "counter_cap"),
         ("evaluation: {gate_m: 0.0}\n", "gate_m: must be positive"),
@@ -218,7 +222,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
         ),
         ("filter: {storage_s: &a [*a]}\n", "Circular reference"),
         ("clock: {node_hz: 2020-01-01}\n", "only plain YAML values"),
-        ("- 1\n", "a mapping of keys to values is needed, this is [1]"),
+        ("- 1\n", "must contain a mapping of keys to values, not [1]"),
         (
             "? [1, 2]\n: 3\n",
             "config.yaml: only plain YAML values and text keys are allowed",
@@ -253,7 +257,7 @@ def test_a_name_with_a_dot_stands_in_quotes() -> None:
     "setting", ["", "=", "=1", "a", "a.=1", ".a=1", "a..b=1", 'a."b=1', 'a""b=1']
 )
 def test_a_setting_that_is_no_setting_says_how_to_write_it(setting: str) -> None:
-    with pytest.raises(CallError, match="write key=value"):
+    with pytest.raises(CallError, match="must be key=value"):
         load(Config, None, [setting])
 
 
@@ -273,7 +277,7 @@ def test_a_wrong_setting_names_its_key(setting: str, message: str) -> None:
 
 def test_a_path_through_a_single_value_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, "filter: {storage_s: 2.0}\n")
-    with pytest.raises(CallError, match="a single value"):
+    with pytest.raises(CallError, match=r"there is no key .* in the value"):
         load(Config, path, ["filter.storage_s.x=1"])
 
 
@@ -316,11 +320,11 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(
     [
         (
             "smoother.lag_s=1e308",
-            "smoother.lag_s: a magnitude of 1e-12 to 1e+09, or 0 is needed, not 1e+308",
+            "smoother.lag_s: must be 0, or have a magnitude of 1e-12 to 1e+09, not 1e+308",
         ),
         (
             "sensors.radar.std.speed_mps=1e-300",
-            "sensors.radar.std.speed_mps: a magnitude of",
+            "sensors.radar.std.speed_mps: must be 0, or have a magnitude of",
         ),
         (
             "motion.std_per_s.yaw=-0.3",

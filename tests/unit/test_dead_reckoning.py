@@ -191,6 +191,7 @@ def test_without_a_correlation_time_poses_are_as_reported():
 
 def test_ego_states_whose_uncertainty_is_ignored_cannot_be_fused():
     with pytest.raises(
-        ValueError, match="uncertainty: `independent` with position_time_s, is none"
+        ValueError,
+        match="uncertainty: must be `independent` if position_time_s is set, is none",
     ):
         EgoConfig(uncertainty="none", position_time_s=60.0)

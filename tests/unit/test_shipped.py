@@ -51,7 +51,7 @@ def test_maps_and_settings_go_before_what_the_file_says() -> None:
         ),
         (
             "zzz",
-            "shipped are adsb, airport, ais, autoferry, karle2023, karle2023_reference, kitti, open_space",
+            "shipped files are adsb, airport, ais, autoferry, karle2023, karle2023_reference, kitti, open_space",
         ),
         ("smother.yaml", "smother.yaml: there is no such configuration file"),
         ("some/smoother", "some/smoother: there is no such configuration file"),
