@@ -45,7 +45,6 @@ _HOMES = {
     "message_delays": "fgtrack.evaluation.scores.innovations",
     "moments_of": "fgtrack.evaluation.scores.innovations",
     "named": "fgtrack.evaluation.tables",
-    "ospa": "fgtrack.evaluation.scores.ospa",
     "paired": "fgtrack.evaluation.intervals",
     "position_nees": "fgtrack.evaluation.matching",
     "scenes": "fgtrack.evaluation.matching",
@@ -83,7 +82,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.scores.lagged import lag_metrics as lag_metrics
     from fgtrack.evaluation.scores.multi_object import clear as clear
     from fgtrack.evaluation.scores.multi_object import gospa as gospa
-    from fgtrack.evaluation.scores.ospa import ospa as ospa
     from fgtrack.evaluation.scores.prediction import (
         PREDICTION_STEP_S as PREDICTION_STEP_S,
     )

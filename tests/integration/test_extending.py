@@ -12,6 +12,7 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import fgtrack
 from fgtrack.core.types import EgoState
 from fgtrack.inputs.ros.messages import ODOMETRY, MessageFactory
 
@@ -214,6 +215,37 @@ def texts(title: str) -> list[str]:
     """Blocks of plain text under a heading of the page."""
     section = PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
     return re.findall(r"^```text\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother"])
+def test_range_rates_alone_halve_the_error_of_the_speed_and_start_no_track(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    estimator: str,
+) -> None:
+    [text] = [
+        text
+        for text in re.findall(
+            r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE
+        )
+        if text.startswith("from dataclasses") and "range_rate_mps" in text
+    ]
+    replay, runs = fgtrack.replay, []
+
+    def kept(messages: list[fgtrack.Message], config: fgtrack.Config) -> fgtrack.Run:
+        runs.append(replay(messages, config, estimator=estimator))
+        return runs[-1]
+
+    monkeypatch.setattr(fgtrack, "replay", kept)
+    exec(compile(text, "docs/extending.md", "exec"), {})
+    with_radar, without = (
+        float(line.split()[0]) for line in capsys.readouterr().out.splitlines()
+    )
+    assert with_radar < 0.6 * without
+    updates = runs[0].updates
+    outcomes = updates[updates["sensor"] == "radar"]["disposition"].value_counts()
+    assert set(outcomes.index) <= {"in_sequence", "out_of_sequence", "gated"}
+    assert outcomes["in_sequence"] > 90
 
 
 def test_the_metric_has_a_column_a_value_and_a_name_in_a_sweep(folder: Path) -> None:
