@@ -24,8 +24,8 @@ from numba.extending import lower_builtin, type_callable
 from fgtrack.core.code_store import CodeStore
 
 NOT_STORED = "compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder"
-DAMAGED = "stored loops are damaged or cannot be read: these are compiled again (all of them in some 30 s)"
-COMPILING = "compiling numerical loops, once: some 30 s of processor time for all"
+DAMAGED = "stored loops are damaged or cannot be read: these are compiled again (all of them in some 40 s)"
+COMPILING = "compiling numerical loops, once: some 40 s of processor time for all"
 
 #: Option of `numba.njit`: references to arrays are not counted. The function can allocate no arrays then.
 WITHOUT_COUNTING = {"_nrt": False}
