@@ -419,14 +419,19 @@ class TrackBank(Protocol):
 
 
 @runtime_checkable
-class WindowBank(TrackBank, Protocol):
-    """A bank that keeps the measurements of its windows: the smoothers."""
-
-    def window(self, track_id: int) -> "Window":
-        """Return a copy of the window of a track."""
+class MeasurementBank(TrackBank, Protocol):
+    """A bank that keeps the measurements of its windows."""
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
         """True if an identical measurement was fused and is still kept."""
+
+
+@runtime_checkable
+class WindowBank(MeasurementBank, Protocol):
+    """A bank that gives out its windows: the smoothers."""
+
+    def window(self, track_id: int) -> "Window":
+        """Return a copy of the window of a track."""
 
     def withdraw(self, track_id: int, measurement: Measurement) -> bool:
         """Take a measurement back, as if it had never been fused. Return False if it is not kept."""

@@ -14,6 +14,7 @@ from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     Estimator,
     Measurement,
+    MeasurementBank,
     Start,
     StatesAt,
     TrackBank,
@@ -235,6 +236,7 @@ class SingleObject:
         self._motion = motion
         self.bank = bank
         self._name = name or type(bank).__name__
+        self._kept = bank if isinstance(bank, MeasurementBank) else None
         self._windows = bank if isinstance(bank, WindowBank) else None
         self._first_ns = self._newest_ns = start.stamp_ns
         bank.advance(start.stamp_ns)
@@ -258,7 +260,7 @@ class SingleObject:
             return UpdateResult(UpdateStatus.TOO_OLD)
         if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
-        if self._windows is not None and self._windows.has_fused(0, measurement):
+        if self._kept is not None and self._kept.has_fused(0, measurement):
             return UpdateResult(UpdateStatus.DUPLICATE)
         self.advance(stamp_ns)
         with _own_cause():

@@ -14,11 +14,9 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Alias, Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, SingleObject
-from fgtrack.models.motion import MotionModel, WhiteNoise
+from fgtrack.models.motion import MotionModel
 
 OOSM_GROUP = "fgtrack.oosm"
 EXACT = "any lag, any number"
@@ -28,7 +26,7 @@ ESTIMATORS = Registry(
     {
         "fgtrack.estimators": {
             "ekf-backward-forward": "fgtrack.karle2023.backward_forward:backward_forward",
-            "ekf-replay": "fgtrack.estimation.filters.replay:ReplayEkf",
+            "ekf-replay": "fgtrack.estimation.filters.replay_bank:ekf_replay",
             "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
             "iplf-replay": "fgtrack.estimation.filters.ukf:IplfReplay",
@@ -222,8 +220,6 @@ def estimator_bank(
         )
         return bank
     _check_options(name, factory, 3, own)
-    if factory is ReplayEkf and isinstance(motion, WhiteNoise) and motion.is_compiled:
-        return ReplayBank(motion, lag_s, **own)
     return ObjectBank(
         motion,
         lambda start: start_estimator(name, factory, motion, start, lag_s, options),

@@ -171,7 +171,7 @@ class MeasurementModel:
         """Indices of the components in `COMPONENTS`, shape (k,): their numbers in compiled loops."""
         return np.array([COMPONENTS.index(name) for name in self.components])
 
-    @cached_property
+    @property
     def is_compiled(self) -> bool:
         """True if compiled loops may take the shipped equations: no subclass has replaced a part of them."""
         return type(self) is MeasurementModel

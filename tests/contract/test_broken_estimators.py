@@ -339,12 +339,13 @@ def test_a_wrong_sign_in_a_row_of_the_measurement_jacobian_breaks_the_nonlinear_
 
 
 def negate_row(monkeypatch: pytest.MonkeyPatch, row: str) -> None:
-    """Negate the derivative of the component `row` in every shipped measurement model."""
+    """Negate the derivative of the component `row` in every shipped measurement model, as a plug-in would have it."""
     linear, nonlinear = MeasurementModel.selection, MeasurementModel.jacobian
 
     def sign(model: MeasurementModel) -> FloatArray:
         return np.where([name == row for name in model.components], -1.0, 1.0)[:, None]
 
+    monkeypatch.setattr(MeasurementModel, "is_compiled", False)
     monkeypatch.setattr(
         MeasurementModel, "selection", lambda model, n: sign(model) * linear(model, n)
     )

@@ -23,6 +23,7 @@ from fgtrack.estimation.base import (
     Measurements,
     Start,
     StatesAt,
+    TrackBank,
     UpdateResult,
     UpdateStatus,
     no_states,
@@ -32,11 +33,12 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states, wrapped
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
-from fgtrack.estimation.object_bank import Outcomes, changing_nothing
+from fgtrack.estimation.object_bank import ObjectBank, Outcomes, changing_nothing
 from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.measurement import SensorPose
-from fgtrack.models.motion import WhiteNoise
+from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.robust import compiled_form
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
@@ -237,6 +239,23 @@ class ReplayBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
         return []
+
+    def has_fused(self, track_id: int, measurement: Measurement) -> bool:
+        """True if the window has an identical measurement of this track."""
+        row, seen = self._rows[track_id], measurement.seen_by(self._motion)
+        order, labels, _, windows, measured, views = (
+            each[row] for each in self._arrays
+        )
+        k = len(seen.z)
+        loss, width = compiled_form(seen.loss, k)
+        label = [seen.stamp_ns, k, loss, *seen.model.codes.tolist()]
+        return any(
+            labels[slot, : len(label)].tolist() == label
+            and (measured[slot, 0, :k] == seen.z).all()
+            and (measured[slot, 1 : k + 1, :k] == seen.R).all()
+            and views[slot].tolist() == [*seen.pose, width]
+            for slot in order[: windows[0]].tolist()
+        )
 
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
@@ -470,7 +489,7 @@ class ReplayBank:
         stamp_ns: int,
         steps: dict[int, Outside],
     ) -> FloatArray | None:
-        """State at a stamp given all later steps, (n + 1, n), where one of these was found along a line; else None."""
+        """State at a stamp given all later steps, (n + 1, n), where a later step lies along a line; else None."""
         n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
         links = list[Link]()
         for slot in reversed(order[row, index + 1 : last + 1].tolist()):
@@ -510,3 +529,23 @@ def _results(
             for each in results
         ]
     return results
+
+
+def ekf_replay(
+    motion: MotionModel, lag_s: float, initiation: str = DEFAULT
+) -> TrackBank:
+    """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+
+    It rolls back and re-filters later measurements, as robot_localization does. The motion model of a plug-in is
+    linearised outside the compiled loops, with a `ReplayEkf` for each object. `initiation`: see `Initiation`.
+    """
+    if isinstance(motion, WhiteNoise) and motion.is_compiled:
+        return ReplayBank(motion, lag_s, initiation)
+    return ObjectBank(
+        motion, lambda start: ReplayEkf(motion, start, lag_s, initiation), lag_s
+    )
+
+
+ekf_replay.bank = True  # type: ignore[attr-defined]  # claims, see `fgtrack.estimation.registry.Claims`
+for _claim in ("exact", "retrodicts", "initiates"):
+    setattr(ekf_replay, _claim, getattr(ReplayEkf, _claim))

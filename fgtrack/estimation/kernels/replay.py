@@ -269,7 +269,7 @@ def _check_measured(
     views: FloatArray,
     k: int,
 ) -> None:
-    """Raise `IndexError` unless the arrays of measurements have a place of k components for each step."""
+    """Raise `IndexError` unless the arrays of measurements have k components for each step."""
     check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1])
     check(views.shape[0] == order.shape[0] and views.shape[1] == order.shape[1])
     check(measured.shape[2] > k and measured.shape[3] >= k)
@@ -290,7 +290,7 @@ def _insert(
     z: FloatArray,
     R: FloatArray,
 ) -> int:
-    """Write a measurement into the first free slot of a track, and put the slot in its place; return the index."""
+    """Write a measurement into the first free slot of a track, and move the slot into order; return the index."""
     index, own, k = count, slots[count], len(components)
     label, new = labels[own], measured[own]
     label[STAMP_NS], label[SIZE], label[LOSS] = stamp_ns, k, loss
