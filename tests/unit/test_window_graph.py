@@ -110,6 +110,7 @@ def test_a_window_is_a_copy_of_the_states_between_its_ends() -> None:
     ages_ms = [(each - START.stamp_ns) // MS for each in window.stamps_ns]
     assert ages_ms == [500, 650, 800, 900, 1000, 1100]
     assert len(window.measurements) == 6
+    assert repr(window) == "<Window of 6 states over 0.600 s: CTRV, 6 measurements>"
     assert window.indices == (0, 1, 2, 3, 4, 5)
     for row, stamp_ns in enumerate(window.stamps_ns):
         state = one.state_at(stamp_ns)

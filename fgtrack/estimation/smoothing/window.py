@@ -39,9 +39,9 @@ class Comparison:
     state_names: tuple[str, ...]
     stamps_ns: tuple[int, ...]
     estimates: FloatArray
-    """Difference to the estimates of the smoother, `Window.states`, shape (m, n)."""
+    """Result minus the estimates of the smoother, `Window.states`, shape (m, n)."""
     optimum: FloatArray
-    """Difference to the states after `converge()`, shape (m, n)."""
+    """Result minus the estimates after `converge()`, shape (m, n)."""
 
     @property
     def largest(self) -> float:
@@ -83,6 +83,13 @@ class Window:
     """Fused measurements that are still in the window, in the order of their states."""
     indices: tuple[int, ...]
     """Index of the state that each measurement belongs to. Stamps up to 1 us apart share a state."""
+
+    def __repr__(self) -> str:
+        length_s = seconds(self.stamps_ns[-1] - self.stamps_ns[0])
+        return (
+            f"<Window of {len(self.stamps_ns)} states over {length_s:.3f} s: "
+            f"{type(self.motion).__name__}, {len(self.measurements)} measurements>"
+        )
 
     @cached_property
     def converged(self) -> "Window":
