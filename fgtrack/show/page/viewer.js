@@ -1,32 +1,32 @@
 "use strict";
-// Plays the runs of a report on a canvas. What the controls say is the state of the form; besides there is the view.
+// Plays the runs of a report on a canvas. The state consists of the form's controls and the view.
 
-const BEARING_M = 150; // length of a line of sight
-const SHOWN_S = 0.3; // how long a received detection stays
+const BEARING_M = 150; // length of a drawn line of sight
+const SHOWN_S = 0.3; // display time of a received detection
 const TRAIL_S = 2;
 const WIDTHS_M = [4, 20000];
-const FIRST_WIDTH_M = { ego: 160, other: 40 }; // around the ego more: its opponents are farther away
-const BEHIND = 0.2; // of the width: more of the picture is behind what is followed than ahead of it
-const FARTHEST_M = 10; // a track that is farther from an object is of another one
+const FIRST_WIDTH_M = { ego: 160, other: 40 }; // initial widths; larger around the ego, whose opponents are far away
+const BEHIND = 0.2; // shift of the picture as a share of its width: it shows more behind the followed object
+const FARTHEST_M = 10; // largest distance between a track and its object
 const STRIP_PX = 64;
-const PANES = { leastPx: 300, most: 3 }; // beside one another
-const LINK_MS = 300; // after which the address follows
+const PANES = { leastPx: 300, most: 3 }; // least width and largest number of panes side by side
+const LINK_MS = 300; // delay before the address is updated
 const MARKS = {
   "\u25CF": null,
   "\u25A0": [[-1, -1], [1, -1], [1, 1], [-1, 1]],
   "\u25B2": [[0, -1.2], [-1.1, 1], [1.1, 1]],
   "\u25C6": [[0, -1.3], [-1.3, 0], [0, 1.3], [1.3, 0]],
-}; // corners to the right and down
+}; // corners of the marks, to the right and down
 
 // --- Data ------------------------------------------------------------------------------------------------------------
 
-/** The columns of a table; NaN where a value is missing. */
+/** Columns of a table; NaN for a missing value. */
 function tableOf(columns) {
   const column = ([name, values]) => [name, Float64Array.from(values, (value) => value ?? NaN)];
   return Object.fromEntries(Object.entries(columns).map(column));
 }
 
-/** Number of the first `length` rising values at(0), at(1) ... that are at most `limit`. */
+/** Number of values at most `limit` among the `length` ascending values at(0), at(1) ... */
 function countUpTo(length, limit, at) {
   let [from, to] = [0, length];
   while (from < to) {
@@ -37,13 +37,13 @@ function countUpTo(length, limit, at) {
   return from;
 }
 
-/** Those of `rows`, which rise in time, after `since` and up to `until`. */
+/** The rows after `since` and up to `until`; `rows` are in order of time. */
 function between(rows, times, since, until) {
   const count = (limit) => countUpTo(rows.length, limit, (k) => times[rows[k]]);
   return rows.slice(count(since), count(until + 1e-9));
 }
 
-/** Rows of each value of a column, in their order, by rising value. */
+/** Rows of each value of a column, by ascending value. */
 function rowsOf(values) {
   const rows = new Map([...new Set(values)].sort((a, b) => a - b).map((value) => [value, []]));
   values.forEach((value, row) => rows.get(value).push(row));
@@ -56,14 +56,14 @@ function usualStep(times) {
   return steps.length ? steps[steps.length >> 1] : 0.1;
 }
 
-/** A path through rows of a table: where something was at any time between its first and its last one. */
+/** A path through rows of a table: the pose at any time between the first and the last row. */
 class Path {
   constructor(table, rows = [...table.t.keys()]) {
     Object.assign(this, { table, rows, t: Float64Array.from(rows, (row) => table.t[row]) });
     this.pause = 5 * usualStep(this.t);
   }
 
-  /** x, y and yaw at `time`, linear between stamps; null before the first, after the last one and in a pause. */
+  /** x, y and yaw at `time`, linear between stamps; null before the first stamp, after the last one, and in a pause. */
   at(time) {
     const { x, y, yaw } = this.table;
     const next = countUpTo(this.t.length, time, (k) => this.t[k]);
@@ -76,7 +76,7 @@ class Path {
     return { x: x[a] + share * (x[b] - x[a]), y: y[a] + share * (y[b] - y[a]), yaw: yaw[a] + share * turn };
   }
 
-  /** As `at`, and where there is none the last row before, or the first one; null of an empty path. */
+  /** As `at`; instead of null the last row before `time`, or the first row. null for an empty path. */
   near(time) {
     if (!this.t.length) return null;
     return this.at(time) ?? this.at(this.t[Math.max(0, countUpTo(this.t.length, time, (k) => this.t[k]) - 1)]);
@@ -101,20 +101,20 @@ class Run {
     this.end = Math.max(this.recording.end, this.ticks.at(-1) ?? 0, receipt.at(-1) ?? 0);
   }
 
-  /** Time of the newest tick, and the rows of the tracks and of their past there. */
+  /** Newest tick at `time`, and its rows of tracks and of lagged states. */
   at(time) {
     const tick = this.ticks[countUpTo(this.ticks.length, time + 1e-9, (k) => this.ticks[k]) - 1];
     return { tick, rows: this.tracksOfTick.get(tick) ?? [], past: this.pastOfTick.get(tick) ?? [] };
   }
 
-  /** Row of the track that is nearest to a place at `time`, with its distance; undefined where there is none. */
+  /** Row and distance of the track nearest to a position at `time`; undefined without tracks. */
   nearest(time, place) {
     const { x, y } = this.tracks;
     const found = this.at(time).rows.map((row) => ({ row, distance: Math.hypot(x[row] - place.x, y[row] - place.y) }));
     return found.sort((a, b) => a.distance - b.distance)[0];
   }
 
-  /** Distance of the nearest track to a true object at each tick; NaN where there is none. */
+  /** Distance of the nearest track from a true object at each tick; NaN without a track or truth. */
   errorsAt(object) {
     if (!this.errors.has(object)) {
       const path = this.recording.objects.get(object);
@@ -146,7 +146,7 @@ function readScene(text) {
 
 // --- Drawing ---------------------------------------------------------------------------------------------------------
 
-/** A part of the canvas with runs of one recording over one another; detections are those of the first one. */
+/** Part of the canvas that shows runs of one recording; it draws the detections of the first run. */
 class Pane {
   constructor(viewer, runs, box) {
     Object.assign(this, { viewer, runs, ...box, context: viewer.context, theme: viewer.theme, scene: viewer.scene });
@@ -155,7 +155,7 @@ class Pane {
     Object.assign(this, { x, y, turn, c: this.scale * Math.cos(turn), s: this.scale * Math.sin(turn) });
   }
 
-  /** Place on the canvas, in CSS pixels, of a place in metres. */
+  /** Canvas position [CSS pixels] of a map position [m]. */
   at(x, y) {
     const [dx, dy] = [x - this.x, y - this.y];
     const [left, top] = [this.left + this.width / 2, this.top + this.height / 2];
@@ -181,7 +181,7 @@ class Pane {
     context.restore();
   }
 
-  /** Strokes a line through places. */
+  /** Draws a line through map positions. */
   line(places, colour, width, dash = [], alpha = 1) {
     const { context } = this;
     context.globalAlpha = alpha;
@@ -211,7 +211,7 @@ class Pane {
 
   run(run, time, shows) {
     const { tick, rows, past } = run.at(time);
-    if (!(time - tick <= Math.max(1, 20 * run.step))) return; // long over
+    if (!(time - tick <= Math.max(1, 20 * run.step))) return; // the run has ended
     const { x, y, yaw, t, track, confirmed } = run.tracks;
     for (const row of rows) {
       const trail = between(run.trackPaths.get(track[row]).rows, t, time - TRAIL_S, time);
@@ -225,7 +225,7 @@ class Pane {
     }
   }
 
-  /** The past of a track as it is known now: final states, the states of every lag, the present one. */
+  /** Draws the past of a track as estimated at this time: final, lagged and present states. */
   past(run, row, pastRows, time, shows) {
     const { tracks, past, final } = run;
     const ended = between(run.finalOfTrack.get(tracks.track[row]) ?? [], final.t, time - TRAIL_S, time);
@@ -251,7 +251,7 @@ class Pane {
     context.globalAlpha = 1;
   }
 
-  /** An object of the size of a car, at least some pixels long; its front is marked. */
+  /** Draws an object of a car's size, at least ten pixels long, with a pointed front. */
   box(place, fill, stroke, dash = []) {
     const { context, scene, turn } = this;
     const scale = Math.max(this.scale, 10 / scene.size_m[0]);
@@ -271,7 +271,7 @@ class Pane {
     context.setLineDash([]);
   }
 
-  /** Hollow from the stamp on (sensed, on its way), full from the receipt on, with a line to where its track is then. */
+  /** Draws detections: hollow from the stamp on, full from the receipt on, then with a line to the track. */
   detections(run, time, mode) {
     const { stamp, receipt } = run.detections;
     if (mode === "stamped") {
@@ -280,8 +280,8 @@ class Pane {
       }
       return;
     }
-    const sensed = mode === "both" ? between(run.byStamp, stamp, time - run.longestDelay - 1e-6, time) : [];
-    for (const row of sensed) if (receipt[row] > time + 1e-9) this.detection(run, row, false, 1);
+    const measured = mode === "both" ? between(run.byStamp, stamp, time - run.longestDelay - 1e-6, time) : [];
+    for (const row of measured) if (receipt[row] > time + 1e-9) this.detection(run, row, false, 1);
     for (const row of between(run.byReceipt, receipt, time - SHOWN_S, time)) {
       this.detection(run, row, true, 1 - (time - receipt[row]) / (1.3 * SHOWN_S));
     }
@@ -325,7 +325,7 @@ class Pane {
     }
   }
 
-  /** Frame, and the runs with how far their track is from the followed object. */
+  /** Draws the frame, and the names of the runs with their errors at the followed object. */
   title(time) {
     const { context, theme } = this;
     Object.assign(context, { strokeStyle: theme.grid, lineWidth: 1, font: "600 13px system-ui, sans-serif" });
@@ -358,7 +358,7 @@ class Pane {
   }
 }
 
-/** The errors of runs at a true object over time, and strokes at late detections, below the picture. */
+/** Draws the errors of the runs at a true object over time, with strokes at late detections. */
 function drawStrip(viewer) {
   const { strip, scene, ratio, theme, size, object } = viewer;
   const caption = viewer.form.querySelector(".caption");
@@ -375,12 +375,12 @@ function drawStrip(viewer) {
   for (const time of scene.lateTimes) context.fillRect(at(time), STRIP_PX - 5, 1, 5);
   const runs = viewer.shown();
   const known = Float32Array.from(runs.flatMap((run) => [...run.errorsAt(object)].filter(Number.isFinite))).sort();
-  const highest = known[Math.floor(0.99 * (known.length - 1))] || 1; // few are higher, and cut off
+  const highest = known[Math.floor(0.99 * (known.length - 1))] || 1; // 99 % quantile: higher errors are cut off
   for (const [k, run] of runs.entries()) {
     const errors = run.errorsAt(object);
     const every = Math.max(1, Math.floor(errors.length / (2 * size.width)));
     context.strokeStyle = run.colour;
-    context.lineWidth = Math.min(1 + 1.4 * (runs.length - 1 - k), 4); // equal curves are seen below one another
+    context.lineWidth = Math.min(1 + 1.4 * (runs.length - 1 - k), 4); // wider lines below, so that equal curves remain visible
     context.beginPath();
     for (let tick = 0, isBroken = true; tick < errors.length; tick += every) {
       const place = [at(run.ticks[tick]), (STRIP_PX - 8) * (1 - Math.min(errors[tick] / highest, 1)) + 2];
@@ -420,12 +420,12 @@ class Viewer {
     return this.controls.follow.value;
   }
 
-  /** The true object that is followed; null where something else is. */
+  /** The followed true object; null if anything else is followed. */
   get object() {
     return this.follow.startsWith("object ") ? Number(this.follow.slice(7)) : null;
   }
 
-  /** Values of the checked boxes of a name. */
+  /** Values of the checked boxes with this name. */
   checked(name) {
     return [...this.form.querySelectorAll(`[name=${name}]:checked`)].map((box) => box.value);
   }
@@ -450,7 +450,7 @@ class Viewer {
     this.seek(Math.round((this.time + seconds) * 1e4) / 1e4);
   }
 
-  /** Goes to the next receipt of a detection out of sequence, or with -1 to the one before. */
+  /** Moves to the next receipt of an out-of-sequence detection; with -1 to the previous one. */
   toLate(direction) {
     const { lateTimes } = this.scene;
     const count = countUpTo(lateTimes.length, this.time + direction * 1e-6, (k) => lateTimes[k]);
@@ -458,7 +458,7 @@ class Viewer {
     this.seek(lateTimes[direction > 0 ? count : count - 1] ?? this.time);
   }
 
-  /** What is followed stays where it is in the picture; when nothing is, the middle does. */
+  /** Zooms about the followed object; about the middle of the picture if nothing is followed. */
   zoom(factor) {
     const width = Math.min(Math.max(this.view.width * factor, WIDTHS_M[0]), WIDTHS_M[1]);
     const share = this.follow === "nothing" ? 1 : width / this.view.width;
@@ -473,14 +473,14 @@ class Viewer {
     this.changed();
   }
 
-  /** Metres to the right of and above what is followed at which the middle is, and the width of a picture. */
+  /** Resets the view: the offset of the picture's middle from the followed object, and its width, in metres. */
   resetView(width = FIRST_WIDTH_M[this.follow] ?? FIRST_WIDTH_M.other) {
     const isBehind = this.controls.turn.value === "travel" && this.follow !== "ego" && this.follow !== "nothing";
     this.view = { x: isBehind ? -BEHIND * width : 0, y: 0, width };
     this.changed();
   }
 
-  /** What is in the middle of a pane of `run`, and the direction that points to the right. */
+  /** Map position in the middle of a pane of `run`, and the direction that points to the right. */
   middle(run = this.shown()[0]) {
     const target = this.target(run);
     const turn = this.controls.turn.value === "travel" && Number.isFinite(target.yaw) ? target.yaw : 0;
@@ -488,14 +488,14 @@ class Viewer {
     return { x: target.x + c * this.view.x - s * this.view.y, y: target.y + s * this.view.x + c * this.view.y, turn };
   }
 
-  /** Where what is followed is at this time, in the recording of `run`. */
+  /** Pose of the followed object at this time, in the recording of `run`. */
   target({ recording, trackPaths }) {
     const id = Number(this.follow.split(" ")[1]);
     const path = { ego: recording.ego, object: recording.objects.get(id), track: trackPaths.get(id) };
     return path[this.follow.split(" ")[0]]?.near(this.time) ?? { x: 0, y: 0 };
   }
 
-  /** The moment of the report and the object or track that it is about; without one a late detection near the start. */
+  /** Starts at the moment of the report, and follows its object or track; without a moment at an early late detection. */
   begin() {
     const { moment, runs, lateTimes } = this.scene;
     const first = Math.min(...runs.map((run) => run.tracks.t[0] ?? Infinity));
@@ -512,7 +512,7 @@ class Viewer {
     this.resetView();
   }
 
-  /** Chooses an option; one that is not there changes nothing. */
+  /** Chooses an option; a missing option changes nothing. */
   choose(name, value) {
     const options = [...this.controls[name].options].map((option) => option.value);
     if (options.includes(value)) this.controls[name].value = value;
@@ -520,12 +520,12 @@ class Viewer {
 
   // --- the picture
 
-  /** How many panes have room beside one another. */
+  /** Number of panes that fit side by side. */
   columns() {
     return Math.min(Math.max(1, Math.floor(this.form.clientWidth / PANES.leastPx)), PANES.most);
   }
 
-  /** The runs of each pane: of one, or of all of a recording. */
+  /** Runs of each pane: a single run, or all runs of a recording. */
   groups() {
     const runs = this.shown();
     if (this.controls.layout.value === "side") return runs.map((run) => [run]);
@@ -545,7 +545,7 @@ class Viewer {
     return this.scene.sensor_colours[index % this.scene.sensor_colours.length];
   }
 
-  /** Draws with the next frame. */
+  /** Requests drawing with the next frame. */
   changed() {
     this.frame ??= requestAnimationFrame((now) => this.onFrame(now));
   }
@@ -593,38 +593,38 @@ class Viewer {
     this.draw();
   }
 
-  /** Takes the colours of the page. */
+  /** Reads the colours of the page. */
   readTheme() {
     const style = getComputedStyle(this.form);
     const names = ["background", "text", "grid", "bound", "truth", "ego", "unused"];
     this.theme = Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
   }
 
-  // --- links: #t=12.34&view=-8,0,40&follow=..., what the controls say and the view
+  // --- links: #t=12.34&view=-8,0,40&follow=..., the controls and the view
 
   link() {
-    const said = new URLSearchParams(new FormData(this.form));
-    said.set("t", String(Number(this.time.toFixed(4))));
-    said.set("view", [this.view.x, this.view.y, this.view.width].map((value) => Number(value.toFixed(2))).join(","));
-    return `#${said.toString().replaceAll("%2C", ",")}`;
+    const settings = new URLSearchParams(new FormData(this.form));
+    settings.set("t", String(Number(this.time.toFixed(4))));
+    settings.set("view", [this.view.x, this.view.y, this.view.width].map((value) => Number(value.toFixed(2))).join(","));
+    return `#${settings.toString().replaceAll("%2C", ",")}`;
   }
 
-  /** Shows what `link` says, and returns whether it names a moment. What it does not say stays as it is. */
+  /** Applies the settings of `link`; returns true if it contains a time. Missing settings stay unchanged. */
   showLink(link) {
-    const said = new URLSearchParams(link.slice(1));
-    if (!said.has("t")) return false;
-    for (const name of ["speed", "follow", "turn", "layout", "detections"]) this.choose(name, said.get(name));
+    const settings = new URLSearchParams(link.slice(1));
+    if (!settings.has("t")) return false;
+    for (const name of ["speed", "follow", "turn", "layout", "detections"]) this.choose(name, settings.get(name));
     for (const name of ["show", "run"]) {
-      const values = new Set(said.getAll(name));
+      const values = new Set(settings.getAll(name));
       const boxes = [...this.form.querySelectorAll(`[name=${name}]`)];
       if (boxes.some((box) => values.has(box.value))) for (const box of boxes) box.checked = values.has(box.value);
     }
     this.resetView();
-    const [x, y, width] = (said.get("view") ?? "").split(",").map(Number);
+    const [x, y, width] = (settings.get("view") ?? "").split(",").map(Number);
     if ([x, y, width].every(Number.isFinite) && width > 0) this.view = { x, y, width };
-    this.zoom(1); // within its limits
+    this.zoom(1); // apply the limits
     this.play(false);
-    this.seek(Number(said.get("t")));
+    this.seek(Number(settings.get("t")));
     return true;
   }
 
@@ -668,7 +668,7 @@ class Viewer {
     }
   }
 
-  /** What keys and buttons do. */
+  /** Action of a key or button. */
   action(name, isLong = false) {
     const tick = isLong ? 1 : this.scene.runs[0].step;
     const speed = (by) => {
@@ -691,7 +691,7 @@ class Viewer {
     }[name];
   }
 
-  /** Lets the controls act from here on. */
+  /** Connects the controls. */
   listen() {
     const { form, canvas, strip, controls } = this;
     const on = (part, event, does) => part.addEventListener(event, (given) => {
@@ -736,7 +736,7 @@ class Viewer {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.readTheme(); this.changed(); });
   }
 
-  /** Moves the picture by one pointer or two, and zooms as far as two spread. */
+  /** Moves the picture by one or two pointers, and zooms by the distance of two. */
   listenToPointers() {
     const [{ canvas }, held] = [this, new Map()];
     canvas.addEventListener("pointerdown", (event) => {
