@@ -234,7 +234,7 @@ def _thinned(
     step = max(1, math.ceil(num_rows / most))
     if step > 1:
         notes[
-            f"{label}: the viewer shows every {step}th time, because there are {num_rows} rows"
+            f"{label}: the viewer shows one time in {step}, because there are {num_rows} rows"
         ] = None
     kept_ns = np.unique(tables[0][time])[::step]
     return [

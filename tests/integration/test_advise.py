@@ -272,7 +272,7 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
     (clock,) = [one for one in advice.findings if one.kind == "clock"]
     assert (
-        "later than those of radar. radar is received 40 ms after its stamps at least"
+        "later than those of radar. radar arrives at least 40 ms after its stamps"
         in clock.text
     )
     assert (

@@ -99,7 +99,7 @@ def test_noise_that_does_not_fit_names_the_command_that_fits_it(call: Call) -> N
     (line,) = [
         line
         for line in warned
-        if "the configured noise is too small; errors are" in line
+        if "the configured noise is too small, errors are" in line
     ]
     command = line.split("`")[1]
     assert (
