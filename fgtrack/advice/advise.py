@@ -6,11 +6,11 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
+from fgtrack.advice.input_checks import TRIAL_S, input_checks, messages_within
 from fgtrack.advice.ledger import SUMMARY_S, summary
-from fgtrack.advice.outcome import RunQuality, harm, noise_findings, objection
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import PairedReplay
-from fgtrack.advice.trial import TRIAL_S, input_checks, messages_within
+from fgtrack.advice.run_quality import RunQuality, harm, noise_findings, objection
 from fgtrack.clocks.arrivals import (
     FEWEST,
     LONGEST_STORAGE_S,

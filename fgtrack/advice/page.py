@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from textwrap import TextWrapper
 
-from fgtrack.advice.outcome import RunQuality
+from fgtrack.advice.run_quality import RunQuality
 from fgtrack.clocks.arrivals import Arrivals
 from fgtrack.config.settings import Config
 from fgtrack.core.finding import Finding

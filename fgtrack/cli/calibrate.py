@@ -10,15 +10,15 @@ from typing import Annotated
 from typer import Option
 
 from fgtrack.advice.advise import advise as advised
-from fgtrack.advice.page import rounded_ms
-from fgtrack.advice.starting import starting_config
-from fgtrack.advice.trial import (
+from fgtrack.advice.input_checks import (
     TRIAL_S,
     counted_lines,
     first_contents,
     input_checks,
     messages_within,
 )
+from fgtrack.advice.page import rounded_ms
+from fgtrack.advice.starting_config import starting_config
 from fgtrack.cli.arguments import (
     ConfigFile,
     Input,

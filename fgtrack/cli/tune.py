@@ -8,7 +8,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from fgtrack.advice.outcome import noise_fits
+from fgtrack.advice.run_quality import noise_fits
 from fgtrack.cli.arguments import (
     ConfigFile,
     Json,

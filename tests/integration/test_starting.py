@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.messages import START_NS, drive, shared
 
 import fgtrack
-from fgtrack.advice.starting import starting_config
+from fgtrack.advice.starting_config import starting_config
 from fgtrack.cli.main import run
 from fgtrack.config.reading import read_config
 from fgtrack.core.types import DetectionList, EgoState, TruthState

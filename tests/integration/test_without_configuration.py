@@ -7,7 +7,7 @@ import pytest
 from support.examples import slow
 
 import fgtrack
-from fgtrack.advice.outcome import RunQuality
+from fgtrack.advice.run_quality import RunQuality
 from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.runs import Run

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.advice.outcome import NoiseFit, RunQuality, harm
+from fgtrack.advice.run_quality import NoiseFit, RunQuality, harm
 from fgtrack.clocks.arrivals import Arrivals
 from fgtrack.clocks.offsets import OffsetReport, SensorOffset
 from fgtrack.clocks.stamps import clock_findings, clock_text, stamp_findings

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from fgtrack.advice.trial import TRIAL_S, input_checks, messages_within
+from fgtrack.advice.input_checks import TRIAL_S, input_checks, messages_within
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import DataError, FgtrackError

@@ -7,7 +7,7 @@ from pathlib import Path
 from support.messages import drive
 from typer.testing import CliRunner
 
-from fgtrack.advice.trial import first_contents, input_checks
+from fgtrack.advice.input_checks import first_contents, input_checks
 from fgtrack.cli.main import app
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import dump, validate
