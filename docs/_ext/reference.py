@@ -190,6 +190,22 @@ def estimators_page() -> str:
     return "\n".join(lines)
 
 
+def motion_models_page() -> str:
+    """A table of all motion models that come with fgtrack."""
+    from fgtrack.estimation.registry import MOTION_MODELS
+
+    lines = ["| name | model | state | noise densities |", "|---|---|---|---|"]
+    for name in MOTION_MODELS:
+        if name not in MOTION_MODELS.sources():
+            model = MOTION_MODELS.load(name)
+            summary = _one_line((inspect.getdoc(model) or "").partition("\n\n")[0])
+            entries, densities = (", ".join(f"`{each}`" for each in names) for names in (
+                model.state_names, model.density_names()
+            ))
+            lines.append(f"| `{name}` | {summary} | {entries} | {densities or '-'} |")
+    return "\n".join(lines)
+
+
 _GROUPS = {
     "Recordings, runs, live use": ("inputs", "runs", "pipeline", "config", "sim"),
     "Evaluation, figures, reports": ("evaluation", "show", "recording_study"),
@@ -236,7 +252,7 @@ def _whole_sentences(app: Any, what: str, name: str, value: Any, options: Any, l
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Directives `settings`, `estimators` and `public-names` for Sphinx."""
+    """Directives `settings`, `estimators`, `motion-models` and `public-names` for Sphinx."""
     from docutils.nodes import Node
     from sphinx.util.docutils import SphinxDirective
 
@@ -251,6 +267,7 @@ def setup(app: Any) -> dict[str, bool]:
 
     app.add_directive("settings", directive(settings_page, 1))
     app.add_directive("estimators", directive(estimators_page, 0))
+    app.add_directive("motion-models", directive(motion_models_page, 0))
     app.add_directive("public-names", directive(public_names, 0))
     app.connect("autodoc-process-docstring", _whole_sentences, priority=100)  # before Napoleon
     return {"parallel_read_safe": True}

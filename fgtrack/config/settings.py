@@ -246,7 +246,7 @@ class MotionConfig:
     """Motion model and its process noise."""
 
     kind: str = "auto"
-    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's Euler steps), or the name of a plug-in.
+    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's Euler steps), or the name of any other registered model.
 
     `auto` is `ctrv` if a sensor measures the yaw or reads it from the map. Otherwise it
     is `ct`, because the heading of an object at rest is then unknown.

@@ -293,7 +293,10 @@ from fgtrack.estimation.registry import MOTION_MODELS, motion_model
 assert list(MOTION_MODELS)[-1] == "acceleration"
 assert not MOTION_MODELS.sources()  # no plug-in
 fgtrack.testing.check_motion_model(motion_model("acceleration", {}))
+import reference
+assert "`jerk_density_m2ps5`" in reference.motion_models_page()
 """
+    shutil.copy(ROOT / "docs/_ext/reference.py", tmp_path)
     followed(tmp_path, ["-c", script])
 
 
