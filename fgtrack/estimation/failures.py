@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from traceback import format_exception
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
+
+from fgtrack.core.state import Stateful
 
 __all__ = ["Containment", "EstimatorError", "Failure", "Failures"]
 
@@ -57,8 +59,15 @@ class EstimatorError(Exception):
 
 
 @dataclass
-class Failures:
+class Failures(Stateful):
     """Counts by kind, shared by all that may fail in one tracker."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "counts",
+        "ended",
+        "first",
+        "last",
+    )
 
     counts: Counter[Failure] = field(default_factory=Counter)
     ended: list[dict[str, int | str]] = field(default_factory=list)

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import numpy as np
 
 from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import (
@@ -91,8 +92,13 @@ class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
             raise EstimatorError(causes, {}, self._track_ids) from error
 
 
-class ObjectBank(Generic[_E]):
+class ObjectBank(Stateful, Generic[_E]):
     """One `Estimator` per object, made by `start`. Exceptions, but `DataError`, become an `EstimatorError`."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "present_ns",
+        "_starts",
+    )
 
     def __init__(
         self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float
@@ -101,8 +107,26 @@ class ObjectBank(Generic[_E]):
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
         self._estimators: dict[int, _E] = {}
+        self._starts: dict[int, Start] = {}  # what each estimator began with
         self.present_ns = 0
         """See `TrackBank.present_ns`."""
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`. Raises `CallError` for an estimator that has no checkpoint."""
+        estimators = {
+            track_id: stateful(item).checkpoint()
+            for track_id, item in self._estimators.items()
+        }
+        return {**super().checkpoint(), "estimators": estimators}
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`; each estimator is made again from its start, and gets its state."""
+        super().restore(snapshot)
+        self._estimators = {}
+        for track_id, own in snapshot["estimators"].items():
+            item = self._start(self._starts[track_id])
+            stateful(item).restore(own)
+            self._estimators[track_id] = item
 
     @property
     def window_start_ns(self) -> int:
@@ -150,10 +174,11 @@ class ObjectBank(Generic[_E]):
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         self._estimators[track_id] = self._start(prior)
+        self._starts[track_id] = prior
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`."""
-        del self._estimators[track_id]
+        del self._estimators[track_id], self._starts[track_id]
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
@@ -225,10 +250,16 @@ def _own_cause() -> Iterator[None]:
         raise error.causes.get(0, error) from error
 
 
-class SingleObject:
+class SingleObject(Stateful):
     """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
     `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_first_ns",
+        "_newest_ns",
+        "bank",
+    )
 
     def __init__(
         self, motion: MotionModel, bank: TrackBank, start: Start, name: str = ""
@@ -241,6 +272,11 @@ class SingleObject:
         self._first_ns = self._newest_ns = start.stamp_ns
         bank.advance(start.stamp_ns)
         bank.birth(0, start)
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`. Raises `CallError` for a plug-in that has no checkpoint."""
+        stateful(self.bank)
+        return super().checkpoint()
 
     @property
     def window_ns(self) -> tuple[int, int]:

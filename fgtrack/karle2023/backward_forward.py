@@ -9,11 +9,12 @@ baseline, and no replay.
 from collections.abc import Sequence
 from functools import partial
 from itertools import compress
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from fgtrack.core.linalg import kernels
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import (
@@ -36,13 +37,25 @@ _KERNELS = "fgtrack.karle2023.storage_kernels"
 _STATUS = UpdateStatus.FAILED, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
 
 
-class BackwardForwardBank:
+class BackwardForwardBank(Stateful):
     """EKFs of all objects on a common time grid with their stored states (the paper's object storage).
 
     The bank stores anchors: states at births and measurements. States between them are
     predicted from the preceding anchor, see `fgtrack.karle2023.storage_kernels`. The
     storage reaches back `storage_steps` steps of `step_ns`.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_now_ns",
+        "_grid_ns",
+        "_grid",
+        "_rows",
+        "_order",
+        "_free",
+        "_latest_start",
+        "_arrays",
+        "_cached",
+    )
 
     def __init__(
         self, propagator: ExactPropagator, step_ns: int, storage_steps: int

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -38,6 +38,11 @@ class PublishedEgo(EgoTrajectory):
     The nearest entry replaces interpolation. On every tick without a new message, the
     low-pass filters its own output again.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *EgoTrajectory.STATE,
+        "_stored",
+    )
 
     _straight = True
 
@@ -107,6 +112,12 @@ class SlotInbox(Inbox):
     A second message within a tick overwrites the first one. A repeated stamp empties
     the slot. The mean of object stamps is computed in floating point.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *Inbox.STATE,
+        "_slots",
+        "_last_stamp_ns",
+    )
 
     def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
         super().__init__(sensors)
@@ -317,6 +328,11 @@ class PublishedTracker(Tracker):
     the track. That position was known after the previous batch, or at the end of the
     previous tick.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *Tracker.STATE,
+        "_last_known",
+    )
 
     def __init__(self, parts: TrackerParts) -> None:
         super().__init__(parts)

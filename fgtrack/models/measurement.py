@@ -8,7 +8,7 @@ turn positive, is that of the way of the object: its yaw rate over its speed. No
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,6 +74,12 @@ class MeasurementModel:
                 f"measurement of {', '.join(self.components)}: state of {', '.join(self.state_names)}: must begin with "
                 f"{' or '.join(', '.join(each) for each in begins)}"
             )
+
+    def __reduce_ex__(self, protocol: Any) -> Any:  # Any: as `object` has it
+        """Read back from a file as the shared model, so that equal measurements stay one stack."""
+        if type(self) is MeasurementModel:
+            return _shared_model, (self.components, self.state_names)
+        return super().__reduce_ex__(protocol)
 
     @cached_property
     def angular(self) -> tuple[int, ...]:

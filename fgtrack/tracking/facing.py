@@ -23,12 +23,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels, stacked
+from fgtrack.core.state import Stateful
 from fgtrack.core.types import (
     ACCEL,
     SPEED,
@@ -207,8 +208,24 @@ def as_read(
     return parts
 
 
-class Facing:
+class Facing(Stateful):
     """Belief about the front of each track, and the shares of wrong yaws of each sensor; see the module."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_rows",
+        "_last_ids",
+        "_last_rows",
+        "_free",
+        "_log_odds",
+        "_stamps_ns",
+        "_least_log_odds",
+        "_turned",
+        "_is_any_turned",
+        "_ended",
+        "_seen",
+        "_shares",
+        "counts",
+    )
 
     def __init__(self, cartesian: bool) -> None:
         """`cartesian`: the states have velocities instead of yaw and speed."""

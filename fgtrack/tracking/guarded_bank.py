@@ -3,12 +3,13 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.linalg import kernels
+from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     Measurement,
@@ -28,13 +29,19 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 
-class GuardedBank:
+class GuardedBank(Stateful):
     """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
     Where it is unknown which track failed, all tracks of that call end. A track whose state is known to be as before
     goes on (`EstimatorError.unchanged`). A `DataError` is an answer, not a failure, and propagates; so does a
     `CallError` until a first track could be started: the estimator cannot be made as it is configured. `make` gives an
     empty bank.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_now_ns",
+        "_alive",
+        "_can_start",
+    )
 
     def __init__(
         self, make: Callable[[], TrackBank], failures: Failures | None = None
@@ -45,6 +52,15 @@ class GuardedBank:
         self._can_start = False
         self.failures = failures or Failures()
         """Counts of failures and of the tracks that they have ended."""
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`. Raises `CallError` for a plug-in that has no checkpoint."""
+        return {**super().checkpoint(), "bank": stateful(self._bank).checkpoint()}
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`."""
+        super().restore(snapshot)
+        stateful(self._bank).restore(snapshot["bank"])
 
     @property
     def present_ns(self) -> int:

@@ -3,13 +3,16 @@
 import marshal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from hashlib import blake2b
 from itertools import compress, repeat
 from operator import attrgetter
+from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import (
     Detection,
@@ -194,8 +197,14 @@ def _origin(sensor: str, detection: Detection) -> _Origin:
 _values = attrgetter(*(each.name for each in fields(Detection)))
 
 
-class Inbox:
+class Inbox(Stateful):
     """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_receipts_ns",
+        "_pending",
+        "_originals",
+    )
 
     def __init__(
         self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0
@@ -209,7 +218,7 @@ class Inbox:
         }
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
         self._receipts_ns: dict[
-            tuple[str, int, Frame, int], int
+            tuple[str, int, Frame, bytes], int
         ] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
         self._originals: dict[_Origin, DetectionList] = {}
@@ -297,7 +306,7 @@ class Inbox:
 
     def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """True if `message` repeats one that is remembered; it is remembered from now on.
-        Compared are its usable detections, in any order, by their bits: NaN equals nothing, and hash(-1) hash(-2).
+        Compared are its usable detections, in any order, by their bits: NaN equals nothing.
         """
         if message.objects and not any(usable):
             return False
@@ -318,7 +327,8 @@ class Inbox:
             message.sensor,
             message.stamp_ns,
             message.frame,
-            hash((len(contents), *sorted(contents))),
+            # Unlike a hash, the digest is the same in the process that loads a saved tracker.
+            blake2b(b"".join(sorted(contents)), digest_size=16).digest(),
         )
         if key in self._receipts_ns:
             return True

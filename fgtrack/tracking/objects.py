@@ -5,9 +5,11 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
+from typing import ClassVar
 
 import numpy as np
 
+from fgtrack.core.state import Stateful
 from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray, ObjectReport
 
 #: Selects pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
@@ -79,11 +81,20 @@ class Evidence:
         )
 
 
-class Objects:
+class Objects(Stateful):
     """Class, identity and size of each track, and the pairs that they exclude.
     A detection with a class may only belong to a track of its class, which is that of most of its detections, or of
     one like it; one without a class to any. Identities are evidence, see `Evidence`.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_seen",
+        "_ids",
+        "_owners",
+        "_former",
+        "_strays",
+        "id_conflicts",
+    )
 
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}

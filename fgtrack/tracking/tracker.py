@@ -6,12 +6,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, repeat
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError, DataError, FgtrackError, did_you_mean
+from fgtrack.core.state import copied_attributes, put_back
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     FRAMES,
@@ -73,6 +74,7 @@ from fgtrack.tracking.lives.latency import FOREVER, NEVER, Delays, Watermarks
 from fgtrack.tracking.objects import Apart, Evidence, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
+from fgtrack.tracking.tracker_state import TrackerState
 
 if TYPE_CHECKING:
     from fgtrack.estimation.smoothing.window import Window
@@ -130,6 +132,20 @@ class Tracker:
     Every detection received ends in exactly one record of exactly one tick. After an exception, or an interrupt, the
     next tick goes on: it reports what was processed, and processes what was not.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_tick",
+        "_next_id",
+        "_records",
+        "_waiting",
+        "_begun",
+        "_num_measured",
+        "_undirected",
+        "_directed",
+        "_newborn",
+        "refused_ego",
+        "last_updates",
+    )
 
     def __init__(self, parts: TrackerParts) -> None:
         self._parts = parts
@@ -190,6 +206,38 @@ class Tracker:
     def yaws(self) -> Mapping[str, Mapping[str, int]]:
         """By sensor: numbers of `yaws` of matched detections, and of the `flipped` and `unused` ones, see `Facing`."""
         return {} if self._parts.facing is None else self._parts.facing.counts
+
+    def checkpoint(self) -> TrackerState:
+        """Return a copy of the state between two ticks, from which `restore` goes on with the same bits.
+
+        Raises `CallError` for an estimator of a plug-in that has no checkpoint.
+        """
+        parts = self._parts
+        return TrackerState(
+            copied_attributes(self, self.STATE),
+            parts.bank.checkpoint(),
+            parts.lifecycle.checkpoint(),
+            parts.objects.checkpoint(),
+            parts.ego.checkpoint(),
+            parts.inbox.checkpoint(),
+            parts.watermarks.checkpoint(),
+            parts.failures.checkpoint(),
+            None if parts.facing is None else parts.facing.checkpoint(),
+        )
+
+    def restore(self, state: TrackerState) -> None:
+        """Put back a checkpoint of a tracker of the same configuration. It can be put back again."""
+        parts = self._parts
+        put_back(self, self.STATE, state.tracks)
+        parts.bank.restore(state.bank)
+        parts.lifecycle.restore(state.lifecycle)
+        parts.objects.restore(state.objects)
+        parts.ego.restore(state.ego)
+        parts.inbox.restore(state.inbox)
+        parts.watermarks.restore(state.watermarks)
+        parts.failures.restore(state.failures)
+        if parts.facing is not None and state.facing is not None:
+            parts.facing.restore(state.facing)
 
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""

@@ -4,7 +4,7 @@ import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
@@ -58,6 +58,11 @@ class ReplayEkf(WindowedFilter):
     It rolls back and re-filters later measurements, as robot_localization does. Filters with another prediction or
     correction override `predict` and `correct`. `initiation`: see `Initiation`.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *WindowedFilter.STATE,
+        "steps",
+    )
 
     exact = "any lag, any number"
     retrodicts = True

@@ -4,12 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.linalg import equal_ones, kernels
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import (
     BoolArray,
@@ -71,7 +72,7 @@ class Outside(NamedTuple):
 _INSIDE = Outside(None, None)
 
 
-class ReplayBank:
+class ReplayBank(Stateful):
     """The replaying EKFs of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
 
     A track leaves the loop, and is replayed step by step, while its window has a step at which the direction of travel
@@ -86,6 +87,17 @@ class ReplayBank:
     initiation
         See `Initiation`.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "present_ns",
+        "_start_ns",
+        "_rows",
+        "_order",
+        "_outside",
+        "_free",
+        "_arrays",
+        "_shape",
+    )
 
     def __init__(
         self, motion: WhiteNoise, lag_s: float, initiation: str = DEFAULT

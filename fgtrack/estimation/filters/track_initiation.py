@@ -5,11 +5,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.checks import as_stamp
 from fgtrack.core.geometry import cartesian, polar
+from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import (
@@ -192,11 +194,18 @@ def initiated(
     return make(start) if search is None else Initiated(search, make)
 
 
-class Initiated:
+class Initiated(Stateful):
     """An `Estimator` that is reinitialised along the first positions until their direction is certain.
     A new one that starts along the line (see `TrackInitiation.turned`) fuses all measurements so far, in order of
     stamps.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_search",
+        "_fused",
+        "_clock_ns",
+        "_inner",
+    )
 
     def __init__(
         self, search: TrackInitiation, make: Callable[[Start], Estimator]
@@ -206,6 +215,11 @@ class Initiated:
         self._fused: list[Measurement] = []
         self._clock_ns = search.start.stamp_ns
         self._inner = make(search.start)
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`. Raises `CallError` for an estimator that has no checkpoint."""
+        stateful(self._inner)
+        return super().checkpoint()
 
     @property
     def window_ns(self) -> tuple[int, int]:

@@ -1,10 +1,12 @@
 """Base of the filters of one object: a window behind the newest stamp, and the outcome of a measurement."""
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.checks import as_stamp
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import (
     Measurement,
@@ -17,12 +19,17 @@ from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.models.motion import MotionModel
 
 
-class WindowedFilter(ABC):
+class WindowedFilter(Stateful, ABC):
     """An `Estimator` that refuses measurements older than its window and fuses all others by `_fuse`.
 
     The window reaches `lag_s` behind the newest stamp or the clock, and not beyond the stamp of the `prior`. Process
     noise of a motion model composes, so a late measurement may split a stretch of time.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_start_ns",
+        "_newest_ns",
+    )
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion

@@ -1,6 +1,7 @@
 """The joint density of all states in the window."""
 
 import bisect
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,6 +32,11 @@ class AccumulatedStateDensity(WindowedFilter):
 
     Exact for: any lag, any number of late measurements in any order. States in the past are smoothed.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *WindowedFilter.STATE,
+        "_stack",
+    )
 
     exact = "any lag, any number"
     nonlinear = "never"

@@ -1,7 +1,10 @@
 """Hold measurements back until the late ones have come, as in industry."""
 
+from typing import ClassVar
+
 from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import (
@@ -18,7 +21,7 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 
 
-class DelayedHorizon:
+class DelayedHorizon(Stateful):
     """Filter at the front, now - D, with a prediction from the front to now.
 
     Now is the clock, or the newest stamp if that is later. So D = `horizon_s` has to cover the longest delay. Flight
@@ -28,6 +31,11 @@ class DelayedHorizon:
 
     Exact for: the state at now - D, linear model, any number of measurements with delays up to D.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_now_ns",
+        "_ordered",
+    )
 
     exact = "up to now - D: any lag, any number"
     held_s = 0.2

@@ -2,6 +2,7 @@
 
 import bisect
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -55,6 +56,11 @@ class RewindForget(WindowedFilter):
 
     Exact for: nothing; consistent, but all measurements between the late stamp and the present are lost.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *WindowedFilter.STATE,
+        "_steps",
+    )
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         super().__init__(motion, prior, lag_s)

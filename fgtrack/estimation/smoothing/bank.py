@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import (
@@ -35,7 +36,7 @@ from fgtrack.estimation.smoothing.window import Window, window_of
 from fgtrack.models.motion import MotionModel
 
 
-class SmootherBank:
+class SmootherBank(Stateful):
     """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together.
     The least squares are those of a factor graph (Dellaert & Kaess, IJRR 25(12), 2006), with late measurements as in
     Ranganathan, Kaess & Dellaert, IROS 2007.
@@ -56,6 +57,19 @@ class SmootherBank:
     options
         Further `SmootherSettings`; lagged and final states are reported on request.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "solver",
+        "_tracks",
+        "_ids",
+        "_free",
+        "present_ns",
+        "_clock_ns",
+        "_searches",
+        "_order",
+        "_known",
+        "_final",
+    )
 
     make_solver: ClassVar[type[Solver]] = Solver
     bank, exact, nonlinear, smooths, initiates = (

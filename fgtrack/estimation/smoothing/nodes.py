@@ -8,10 +8,11 @@ nodes that exist, and not the longest window times the number of tracks.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from fgtrack.core.state import Snapshot, Stateful, copied_attributes
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
@@ -45,8 +46,24 @@ from fgtrack.models.transitions import transitions
 _FEW_TRACKS, _FEW_NODES, _FEW_VALUES, _FEW_COMPONENTS = 4, 64, 256, 4
 
 
-class Nodes:
+class Nodes(Stateful):
     """Arrays of tracks (tracks, ...), with the order of the nodes, and of numbers (size, ...), with their values."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "tracks",
+        "stamps_ns",
+        "numbers",
+        "_num_numbers",
+        "labels",
+        "backs",
+        "points",
+        "blocks",
+        "rows",
+        "marks",
+        "values",
+        "has_plugins",
+        "_factors",
+    )
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion, n, size = motion, motion.dim, _FEW_VALUES
@@ -77,6 +94,17 @@ class Nodes:
         self.has_plugins = self.compiled is None
         """True if plug-ins model the motion, or have modelled a measurement: these are linearised outside the loops."""
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
+        self._share()
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`."""
+        factors = {number: own.copy() for number, own in self._factors.items()}
+        others = [name for name in self.STATE if name != "_factors"]
+        return {**copied_attributes(self, others), "_factors": factors}
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`."""
+        super().restore(snapshot)
         self._share()
 
     def __setstate__(self, state: dict[str, Any]) -> None:  # Any: of each attribute

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from fgtrack.core.linalg import mahalanobis_squared, noise_root
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
@@ -42,7 +43,7 @@ class NotFusedError(Exception):
         self.cause, self.lost = cause, frozenset(lost)
 
 
-class Solver:
+class Solver(Stateful):
     """Windows of many tracks, each by its number; solved in covariance form by compiled loops.
 
     Parameters
@@ -52,6 +53,11 @@ class Solver:
     settings
         Those of relinearisation and outputs.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "nodes",
+        "_is_nonlinear",
+    )
 
     is_damped: ClassVar[bool] = False
     """True if no step makes the fit worse."""

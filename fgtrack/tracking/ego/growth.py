@@ -24,10 +24,12 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.models.motion import CTRV
@@ -58,8 +60,17 @@ _KEPT_NS = nanoseconds(10.0)  # lists before that share no error that a track re
 _LONG_S = 1e3  # T of an error that stays
 
 
-class EgoGrowth:
+class EgoGrowth(Stateful):
     """Learns how an extrapolated pose of the ego grows uncertain, and for how long its error lasts."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_lasting",
+        "_fading",
+        "_recent",
+        "_learned_ns",
+        "_jumped_ns",
+        "_placed",
+    )
 
     def __init__(
         self, accel_std_mps2: float, yaw_accel_std_radps2: float, density_m2ps3: float

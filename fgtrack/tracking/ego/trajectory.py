@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from operator import attrgetter
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import YAW, EgoState, FloatArray
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain
@@ -155,7 +156,7 @@ def _consistent(before: EgoState, after: EgoState) -> bool:
     )
 
 
-class EgoTrajectory:
+class EgoTrajectory(Stateful):
     """Low-passed ego states, each filtered once, and interpolated between their stamps.
 
     The weights of the low-pass are those of new values. It pulls towards the previous state *extrapolated to the new
@@ -172,6 +173,20 @@ class EgoTrajectory:
     see `dead_reckoning`. An error that all poses of a track have in common is no motion of it, so the position of a
     pose has the variance of a dead reckoning of 1 s, as long as a track remembers, instead of its own.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_growth",
+        "_reckoned",
+        "_newest_ns",
+        "_last",
+        "_held",
+        "_fits",
+        "_states",
+        "_stamps",
+        "current",
+        "jumps",
+        "in_pit",
+    )
 
     _straight = False
 

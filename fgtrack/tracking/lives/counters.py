@@ -3,12 +3,13 @@
 from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from fgtrack.core.settings import settings
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
@@ -83,12 +84,17 @@ class LifecycleRules:
     not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
 
-class CountingLifecycle:
+class CountingLifecycle(Stateful):
     """Counts matches and misses: status of tracks, and which of them end.
     A track is aged by every sensor at the range it is responsible for, and by time alone as well. Only sensors that
     give positions count: a bearing fits whatever is behind or before its object as well, so it neither starts nor
     confirms nor keeps a track.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_watermarks_ns",
+        "lives",
+    )
 
     birth_probability = 0.5
     """Probability that an unassociated detection stems from an object; counts give none."""

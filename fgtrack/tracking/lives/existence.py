@@ -21,13 +21,14 @@ import math
 from bisect import bisect_right, insort
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import OpenProbability, settings
+from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
@@ -128,10 +129,23 @@ class ExistenceRules:
             )
 
 
-class ExistenceLifecycle:
+class ExistenceLifecycle(Stateful):
     """Tracks live by the probability that their objects exist; see the module.
     A list does not count for objects out of its sensor's range and field of view. Without an ego all are in view.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_present_ns",
+        "_watermarks_ns",
+        "_processed_ns",
+        "_scans_ns",
+        "_suspended",
+        "_histories",
+        "_rows",
+        "_lives",
+        "_matches",
+        "_reports",
+    )
 
     def __init__(
         self,

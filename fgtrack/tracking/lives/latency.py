@@ -8,9 +8,11 @@ at watermarks: what a sensor has not reported yet is no evidence that it saw not
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Iterable, Mapping
+from typing import ClassVar
 
 import numpy as np
 
+from fgtrack.core.state import Snapshot, Stateful
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import SensorModel
@@ -26,8 +28,15 @@ _UNUSUAL = 50  # of so many the longest one is unusual
 _MAX_FUTURE_NS = NS_PER_S  # see `fgtrack.tracking.inbox`
 
 
-class Durations:
+class Durations(Stateful):
     """The newest durations of one kind. Of each fifty of them the longest one is unusual."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "arrived_ns",
+        "_ascending_ns",
+        "_limit_ns",
+        "_usual_ns",
+    )
 
     def __init__(self) -> None:
         self.arrived_ns: deque[int] = deque(maxlen=_RECENT)
@@ -61,8 +70,18 @@ class Durations:
         return self._ascending_ns[0]
 
 
-class Delays:
+class Delays(Stateful):
     """Delays of the messages of one source: receipt minus stamp."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "messages",
+        "newest_ns",
+        "newest_receipt_ns",
+        "_recent",
+        "_gaps",
+        "_newest_stamp_ns",
+        "_processed_ns",
+    )
 
     def __init__(self) -> None:
         self.messages = 0
@@ -135,8 +154,10 @@ class Delays:
         return due_ns if is_overdue else processed_ns
 
 
-class Watermarks:
+class Watermarks(Stateful):
     """Delays of all sources, and the watermarks of the sensors."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("delays",)
 
     def __init__(
         self, sensors: Mapping[str, SensorModel], sources: Iterable[str] = ()
@@ -149,6 +170,11 @@ class Watermarks:
         self._limits_ns = [
             FOREVER if limit_s is None else nanoseconds(limit_s) for limit_s in limits_s
         ]
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`; the delays are shared, so they stay the same objects."""
+        for name, delays in self.delays.items():
+            delays.restore(snapshot["delays"][name])
 
     def at(self, now_ns: int, oldest_ns: int) -> IntArray:
         """Return the watermark of each sensor at `now_ns`, shape (sensors,); see `Delays.watermark_ns`.

@@ -7,10 +7,12 @@ observed by the lists of that sensor alone, so the joint probability is the prod
 """
 
 from heapq import heappop, heappush
+from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.linalg import kernels
+from fgtrack.core.state import Stateful
 from fgtrack.core.types import FloatArray, IntArray
 
 #: Bounds of log-odds: a probability that differs from 0 or 1 by less adds nothing.
@@ -25,10 +27,17 @@ _FEWEST_TRACKS, _FEWEST_ENTRIES = 8, 32
 _KERNELS = "fgtrack.tracking.lives.visibility_kernels"
 
 
-class Histories:
+class Histories(Stateful):
     """Evidence of all tracks in order of its stamps, and the probabilities after each, whatever the order of arrival.
     Entry 0 of a track is its birth, or all that is older than what is remembered.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "numbers",
+        "entries",
+        "counts",
+        "_free",
+    )
 
     def __init__(
         self,

@@ -6,10 +6,12 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
+from fgtrack.core.state import Snapshot
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.graph import window_graph
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.solver import Solver
 
 
 class BatchSolver(IncrementalSolver):
@@ -29,24 +31,48 @@ class BatchSolver(IncrementalSolver):
         params.setAbsoluteErrorTol(1e-12)
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
-    def _update(self, tracks: IntArray, starts: IntArray) -> None:
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`; of the graphs it has the last estimates."""
+        estimates = {
+            track: {
+                number: values.atVector(number)
+                for number in self.nodes.window(track).tolist()
+                if values.exists(number)
+            }
+            for track, (_, values) in self._graphs.items()
+        }
+        return {**super().checkpoint(), "estimates": estimates}
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`; the graphs are made again, and not solved."""
+        Solver.restore(self, snapshot)
+        self._graphs.clear()
+        self._read.clear()
+        for track, estimates in snapshot["estimates"].items():
+            values = gtsam.Values()
+            for number, estimate in estimates.items():
+                values.insert(number, estimate)
+            self._graphs[track] = self._graph(track), values
+
+    def _graph(self, track: int) -> gtsam.NonlinearFactorGraph:
+        """Return the nonlinear factors of a window, with a prior instead of what has left it."""
         nodes, n = self.nodes, self.motion.dim
+        numbers = nodes.window(track).tolist()
+        oldest = nodes.predicted[numbers[0]]
+        return window_graph(
+            self.motion,
+            numbers,
+            nodes.window_stamps_ns(track).tolist(),
+            nodes.origin[numbers[0]] + oldest[:, n],
+            oldest[:, :n],
+            nodes.Q[numbers[:-1]],
+            [(number, each) for number in numbers for each in nodes.factors(number)],
+        )
+
+    def _update(self, tracks: IntArray, starts: IntArray) -> None:
+        nodes = self.nodes
         for track in tracks.tolist():
-            numbers = nodes.window(track).tolist()
-            oldest = nodes.predicted[numbers[0]]
-            graph = window_graph(
-                self.motion,
-                numbers,
-                nodes.window_stamps_ns(track).tolist(),
-                nodes.origin[numbers[0]] + oldest[:, n],
-                oldest[:, :n],
-                nodes.Q[numbers[:-1]],
-                [
-                    (number, each)
-                    for number in numbers
-                    for each in nodes.factors(number)
-                ],
-            )
+            numbers, graph = nodes.window(track).tolist(), self._graph(track)
             values = gtsam.Values()
             _, last = self._graphs.get(track, (None, values))
             for number in numbers:

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
+from fgtrack.core.state import Snapshot
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
@@ -91,6 +92,24 @@ class IncrementalSolver(Solver):
         self._graphs: dict[int, Any] = {}  # Any: a subclass has its own
         self._read = set[tuple[int, ...]]()
         """Nodes, and pairs of them, whose covariances were read since something was solved."""
+
+    def checkpoint(self) -> Snapshot:
+        """See `Stateful.checkpoint`; of the graphs it has only which windows have one."""
+        return {**super().checkpoint(), "solved": tuple(self._graphs)}
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """See `Stateful.restore`. iSAM2 cannot be copied, so each graph is made again from its window.
+
+        The new graph has the same factors, linearised at the same points, and eliminates them at once. States then
+        differ by rounding from those of the tracker that went on: less than 1e-9 standard deviations.
+        """
+        super().restore(snapshot)
+        self._graphs.clear()
+        self._read.clear()
+        tracks = np.array(snapshot["solved"], dtype=np.int64)
+        if len(tracks):
+            first = self.nodes.first[tracks]
+            self.solve(tracks, first, first.copy())
 
     def forget(self, track: int) -> None:
         """See `Solver.forget`: the next solution makes a new graph."""
