@@ -21,6 +21,7 @@ _HOMES = {
     "CTRV": "fgtrack.models.motion",
     "CV": "fgtrack.models.motion",
     "CallError": "fgtrack.core.errors",
+    "Checkpoint": "fgtrack.pipeline.live",
     "Config": "fgtrack.config.settings",
     "DataError": "fgtrack.core.errors",
     "Detection": "fgtrack.core.types",
@@ -48,6 +49,7 @@ _HOMES = {
     "SmoothedReport": "fgtrack.core.types",
     "SmootherBank": "fgtrack.estimation.smoothing.bank",
     "Start": "fgtrack.estimation.base",
+    "Stateful": "fgtrack.core.state",
     "StatesAt": "fgtrack.estimation.base",
     "Study": "fgtrack.recording_study",
     "Tables": "fgtrack.evaluation.tables",
@@ -122,6 +124,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.core.errors import FgtrackError as FgtrackError
     from fgtrack.core.geometry import rotation as rotation
     from fgtrack.core.geometry import wrap_angle as wrap_angle
+    from fgtrack.core.state import Stateful as Stateful
     from fgtrack.core.time import NS_PER_S as NS_PER_S
     from fgtrack.core.time import nanoseconds as nanoseconds
     from fgtrack.core.time import seconds as seconds
@@ -185,6 +188,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.sensors import SensorModel as SensorModel
     from fgtrack.noise.parameters import TuneReport as TuneReport
     from fgtrack.noise.tune import tune as tune
+    from fgtrack.pipeline.live import Checkpoint as Checkpoint
     from fgtrack.pipeline.live import Lateness as Lateness
     from fgtrack.pipeline.live import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker

@@ -239,6 +239,7 @@ OWN = {
     "_parts",
     "delays",
     "arrays",
+    "seen",
 }
 
 

@@ -54,10 +54,7 @@ class Solver(Stateful):
         Those of relinearisation and outputs.
     """
 
-    STATE: ClassVar[tuple[str, ...]] = (
-        "nodes",
-        "_is_nonlinear",
-    )
+    STATE: ClassVar[tuple[str, ...]] = ("nodes",)
 
     is_damped: ClassVar[bool] = False
     """True if no step makes the fit worse."""
