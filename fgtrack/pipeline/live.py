@@ -152,7 +152,7 @@ class Tracker:
         "_node",
         "_skipped",
         "_warnings",
-        "_placed",
+        "_need_ego",
     )
     """Attributes that change beside the state of `_tracker` and the messages that have just arrived."""
 
