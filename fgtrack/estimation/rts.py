@@ -5,12 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from fgtrack.core.linalg import applied, congruence, psd_solve, regular, symmetrise
+from fgtrack.core.linalg import applied, kernels, regular
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.ekf import Prediction, joseph, kalman_gain
 from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.models.motion import MotionModel
 
+_KALMAN = "fgtrack.estimation.kernels.kalman"
 Link = tuple[int, FloatArray, FloatArray, Prediction]
 """Stamp, mean (n,) and covariance (n, n) of a state, and its prediction from the link before."""
 
@@ -25,11 +26,24 @@ def rts_step(
     """Return a state, or a stack of them, after the smoothing of the next one, and C = Cov(x, x_next) P_next^-1.
     x + C s and P + C (P_s - P_next) C', of `mean` (..., n) and `covariance` (..., n, n), with the prediction P_next of
     the next state, its `shift` s (..., n) by the smoothing and its covariance P_s = `after` then (..., n, n). Rauch,
-    Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
+    Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965. Raises
+    `numpy.linalg.LinAlgError` where P_next has no root.
     """
-    C = psd_solve(predicted.covariance, predicted.cross).mT
-    P = covariance + congruence(C, after - predicted.covariance)
-    return mean + applied(C, shift), symmetrise(P), C
+    n, shape = mean.shape[-1], covariance.shape
+    x, s = (
+        np.array(np.broadcast_to(each, shape[:-1]), dtype=np.float64, order="C")
+        for each in (mean, shift)
+    )
+    P, P_next, gain, P_s = (
+        np.array(np.broadcast_to(each, shape), dtype=np.float64, order="C")
+        for each in (covariance, predicted.covariance, predicted.cross, after)
+    )
+    stacks = (each.reshape(-1, n, n) for each in (P, P_next, gain))
+    if not kernels(_KALMAN).smooth_states(
+        x.reshape(-1, n), *stacks, s.reshape(-1, n), P_s.reshape(-1, n, n)
+    ):
+        raise np.linalg.LinAlgError("the covariance of a prediction has no root")
+    return x, P, gain.mT
 
 
 def smoothed_back(

@@ -87,6 +87,59 @@ def conclude(
     return total < np.inf
 
 
+@shared(
+    f"b1(float64[::1], {MATRIX}, {READ}, {MATRIX}, float64[::1], {READ}, {MATRIX}, {MATRIX})"
+)
+def smooth_state(
+    mean: FloatArray,
+    P: FloatArray,
+    predicted: FloatArray,
+    gain: FloatArray,
+    shift: FloatArray,
+    after: FloatArray,
+    root: FloatArray,
+    CD: FloatArray,
+) -> bool:
+    """Overwrite a state by x + C s and P + C (P_s - P_-) C', see `fgtrack.estimation.rts.rts_step`.
+
+    The next state has the prediction P_-, the shift s by its smoothing, and then the covariance P_s = `after`. `gain`
+    holds the cross-covariance C P_-, transposed, and then C'. False where P_- has no root.
+    """
+    n = len(mean)
+    copy(predicted, root)
+    if not solve(root, gain):
+        return False
+    for a in range(n):
+        for b in range(n):
+            root[a, b] = after[a, b] - predicted[a, b]
+            mean[a] += gain[b, a] * shift[b]
+    add_weighted(gain, root, CD, P)
+    return True
+
+
+@njit(f"b1({_VECTORS}, {_MATRICES}, {_READ}, {_MATRICES}, {_VECTORS}, {_READ})")
+def smooth_states(
+    means: FloatArray,
+    P: FloatArray,
+    predicted: FloatArray,
+    gains: FloatArray,
+    shifts: FloatArray,
+    after: FloatArray,
+) -> bool:
+    """`smooth_state` of states (m, n) and (m, n, n); False where a prediction has no root."""
+    (m, n), is_regular = means.shape, True
+    check(shifts.shape == (m, n) and P.shape == (m, n, n))
+    check(predicted.shape == P.shape and gains.shape == P.shape)
+    check(after.shape == P.shape)
+    root, CD = scratch(n, n), scratch(n, n)
+    for i in range(m):
+        if not smooth_state(
+            means[i], P[i], predicted[i], gains[i], shifts[i], after[i], root, CD
+        ):
+            is_regular = False
+    return is_regular
+
+
 @shared(f"float64({READ}, {READ}, float64[::1], int64, float64, {MATRIX}, {MATRIX})")
 def robust_weight(
     spread: FloatArray,

@@ -13,7 +13,6 @@ import math
 from fgtrack.core.compiled import (
     MATRIX,
     add_congruence,
-    add_weighted,
     check,
     check_rows,
     copy,
@@ -22,7 +21,6 @@ from fgtrack.core.compiled import (
     njit,
     scratch,
     shared,
-    solve,
     wrapped,
 )
 from fgtrack.core.time import NS_PER_S
@@ -31,6 +29,7 @@ from fgtrack.estimation.kernels.kalman import (
     CorrectionSpace,
     correct_state,
     marginal_nis,
+    smooth_state,
 )
 from fgtrack.models.measurement_kernels import (
     POSE_SIZE,
@@ -82,7 +81,7 @@ def _innovation(
     subtract(codes, measured[0], y, y)
 
 
-_SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1]))"
+_SPACE = f"UniTuple({MATRIX}, 5)"
 
 
 @shared(
@@ -102,7 +101,7 @@ def _retrodict(
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
     n = steps.shape[2]
-    F, root, CD, ahead, mean = space
+    F, root, CD, ahead, smoothed = space
     gain, shift = ahead[n + 1 :], now[0]
     for j in range(len(slots) - 1, 0, -1):
         after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
@@ -114,23 +113,16 @@ def _retrodict(
             _ahead(motion, noise, state, late_ns, F, ahead[0], ahead[1 : n + 1], gain)
         else:
             copy(steps[after, n + 1 :], ahead)
-        copy(ahead[1:], root)
-        if not solve(root, gain):
-            return False
         for a in range(n):
             shift[a] -= ahead[0, a]
-            for b in range(n):
-                root[a, b] = now[1 + a, b] - ahead[1 + a, b]
         if motion == ARC:
             shift[_YAW] = wrapped(shift[_YAW])
-        for a in range(n):
-            mean[a] = state[0, a]
-            for b in range(n):
-                mean[a] += gain[b, a] * shift[b]
-        copy(state, now)
-        for a in range(n):
-            shift[a] = mean[a]
-        add_weighted(gain, root, CD, now[1:])
+        copy(state, smoothed)
+        if not smooth_state(
+            smoothed[0], smoothed[1:], ahead[1:], gain, shift, now[1:], root, CD
+        ):
+            return False
+        copy(smoothed, now)
     return True
 
 
@@ -366,12 +358,12 @@ def fuse(
     check_components(components, n)
     check_rows(rows, 0, k)
     now, most = scratch(n + 1, n), measured.shape[3]
-    F, root, CD, ahead, mean = (
+    F, root, CD, ahead, smoothed = (
         scratch(n, n),
         scratch(n, n),
         scratch(n, n),
         scratch(2 * n + 1, n),
-        scratch(n),
+        scratch(n + 1, n),
     )
     A, AP, K, KR = scratch(n, n), scratch(n, n), scratch(most, n), scratch(n, most)
     marginal, spread, own_noise, column = (
@@ -442,7 +434,7 @@ def fuse(
                     slots[index : count + 1],
                     labels[t],
                     steps[t],
-                    (F, root, CD, ahead, mean),
+                    (F, root, CD, ahead, smoothed),
                     now,
                 )
                 _innovation(motion, now[0], label, new, views[t, own], y[i], H[:k])
@@ -609,12 +601,12 @@ def retrodict(
     _check(tracks, 0, order, labels, steps, windows, n)
     check(len(tracks) > 0 and 0 < index <= last < order.shape[1])
     check(now.shape == (n + 1, n))
-    F, root, CD, ahead, mean = (
+    F, root, CD, ahead, smoothed = (
         scratch(n, n),
         scratch(n, n),
         scratch(n, n),
         scratch(2 * n + 1, n),
-        scratch(n),
+        scratch(n + 1, n),
     )
     t = tracks[0]
     copy(steps[t, order[t, last], n + 1 if index == last else 0 :], now)
@@ -624,7 +616,7 @@ def retrodict(
         order[t, index : last + 1],
         labels[t],
         steps[t],
-        (F, root, CD, ahead, mean),
+        (F, root, CD, ahead, smoothed),
         now,
     )
 

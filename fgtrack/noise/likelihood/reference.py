@@ -10,7 +10,7 @@ from fgtrack.core.linalg import congruence
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
+from fgtrack.estimation.filters.ekf import propagated, updated_one
 from fgtrack.noise.likelihood.contaminated import Update, update
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
 
@@ -88,9 +88,8 @@ def filtered(
         P = result.covariance
         R_assumed = measurement.R[np.ix_(there, there)]
         if there:
-            K, _ = kalman_gain(P, H[there], R_assumed)
-            after = after + K @ (y[there] - H[there] @ result.step)
-            P = joseph(P, K, H[there], R_assumed)
+            left = y[there] - H[there] @ result.step
+            after, P = updated_one(after, P, left, H[there], R_assumed)[:2]
         assumed = y[there], H[there], R_assumed
         steps.append(
             FilterStep(

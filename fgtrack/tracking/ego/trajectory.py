@@ -16,7 +16,7 @@ from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
 from fgtrack.core.state import Stateful
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import YAW, EgoState, FloatArray
-from fgtrack.estimation.filters.ekf import joseph, kalman_gain
+from fgtrack.estimation.filters.ekf import updated_one
 from fgtrack.models.dead_reckoning import (
     PositionEstimate,
     ReportedErrors,
@@ -487,8 +487,7 @@ class EgoTrajectory(Stateful):
         )
         difference = second - first
         difference[YAW] = wrap_angle(difference[YAW])
-        gain, _ = kalman_gain(P, _ALL, R)
-        mean, own = first + gain @ difference, joseph(P, gain, _ALL, R)
+        mean, own = updated_one(first, P, difference, _ALL, R)[:2]
         x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
         total = own if covariance is None else own + covariance
         total.flags.writeable = False
