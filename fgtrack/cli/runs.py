@@ -70,7 +70,7 @@ def export(
         bool,
         Option(
             "--geojson",
-            help="Write tracks in latitude and longitude (.geojson, .csv).",
+            help="Export tracks in latitude and longitude (.geojson, .csv).",
         ),
     ] = False,
     kitti: Annotated[
