@@ -1,4 +1,4 @@
-"""Entry point: runs a command and turns what went wrong into one line and an exit code."""
+"""Runs a command, and turns an error into one line and an exit code."""
 
 import logging
 import os
@@ -22,7 +22,7 @@ from fgtrack.cli.exit_codes import BAD_CALL, BAD_DATA, DONE, INTERRUPTED
 from fgtrack.core.errors import CallError, FgtrackError, one_line
 from fgtrack.core.output import FULL
 
-#: Commands in the order of the help, functions of that name, and the modules that hold them.
+#: Modules of the commands, in the order of the help; the command is the module's function with its name.
 COMMANDS = {
     "demo": "study",
     "study": "study",
@@ -50,7 +50,7 @@ _STYLE: dict[str, Any] = {
 
 
 class _LazyCommands(TyperGroup):
-    """Imports a command's module when the command is called; the help needs none of them."""
+    """Imports a command's module when the command is called; the help imports no such module."""
 
     def resolve_command(
         self, ctx: Any, args: list[str]
@@ -75,7 +75,7 @@ app = typer.Typer(
 
 
 def _help(name: str) -> str:
-    """Docstring of a command, read from its source."""
+    """Docstring of a command, read from the source of its module."""
     source = (
         Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
     )
@@ -107,9 +107,8 @@ def _options(
     ] = 4.0,
 ) -> None:
     """Options before the command; `main` reads --debug itself."""
-    if (
-        max_memory_gb and sys.platform == "linux"
-    ):  # elsewhere the system does not hold to it
+    # Other systems do not enforce this limit.
+    if max_memory_gb and sys.platform == "linux":
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         limit = int(max_memory_gb * 2**30)
         resource.setrlimit(
@@ -119,32 +118,30 @@ def _options(
 
 
 class _OneLine(logging.Formatter):
-    """Warnings of readers, libraries and plug-ins contain names from files."""
+    """Formats log messages on one line, because they may contain names from files."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """See `logging.Formatter.format`; as a terminal can show it."""
+        """Return the message of `record` on one line, without control characters."""
         return one_line(super().format(record))
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command; gives the exit code. Errors are one line on stderr."""
+    """Run one command and return the exit code; an error is one line on stderr."""
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
     memory = resource.getrlimit(resource.RLIMIT_AS)
     logged = logging.StreamHandler()
     logged.setFormatter(_OneLine("fgtrack: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)
-    logging.getLogger("matplotlib").setLevel(
-        logging.ERROR
-    )  # figures need nothing of what it looks for in the system
+    # matplotlib warns about system folders that figures do not need.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     logging.captureWarnings(True)
     try:
         return _run(words, debug)
     finally:
         logging.captureWarnings(False)
-        resource.setrlimit(
-            resource.RLIMIT_AS, memory
-        )  # of whoever calls this from Python
+        # A caller in Python gets its own limit back.
+        resource.setrlimit(resource.RLIMIT_AS, memory)
 
 
 def _run(words: Sequence[str], debug: bool) -> int:
@@ -154,7 +151,7 @@ def _run(words: Sequence[str], debug: bool) -> int:
         )
         if outcome == INTERRUPTED:  # typer turns the exception into this code
             return _failed(
-                "interrupted; what was computed so far is in the output folder",
+                "interrupted; finished results are in the output folder",
                 INTERRUPTED,
                 debug,
             )
@@ -173,24 +170,20 @@ def _run(words: Sequence[str], debug: bool) -> int:
         )
     except MemoryError:
         return _failed(
-            "more memory needed than --max-memory allows: raise it, or split the input",
+            "more memory is needed than --max-memory allows: raise the limit, or split the input",
             BAD_DATA,
             debug,
         )
-    except (
-        OSError
-    ) as error:  # of a path that was given, there or in a file, else of stdout
+    except OSError as error:  # for a given path, or for stdout
         code = BAD_DATA if error.errno in FULL else BAD_CALL
         if error.filename is None:
-            sys.stdout = None  # so that the end of the process does not fail on it, too
+            sys.stdout = None  # otherwise the end of the process would fail on stdout
         return _failed(
             f"{error.filename or 'standard output'}: cannot be used ({error.strerror})",
             code,
             debug,
         )
-    except (
-        Exception
-    ) as error:  # the last line of defence: a bug must not look like bad data
+    except Exception as error:  # a bug must not look like bad data
         return _failed(
             f"internal error: {type(error).__name__}: {error} (run with --debug)",
             BAD_DATA,
@@ -201,20 +194,17 @@ def _run(words: Sequence[str], debug: bool) -> int:
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    with suppress(
-        OSError
-    ):  # where that cannot be written either, the exit code is all that remains
+    # If stderr cannot be written either, only the exit code remains.
+    with suppress(OSError):
         print(f"fgtrack: error: {one_line(message)}", file=sys.stderr, flush=True)
     return code
 
 
 def main() -> int:
-    """Run the command line of this process; gives the exit code."""
-    os.environ["MPLBACKEND"] = (
-        "agg"  # nothing is shown in a window, so none of the system's is needed
-    )
+    """Run the command line of this process and return the exit code."""
+    # Figures are written to files, so no window system is needed.
+    os.environ["MPLBACKEND"] = "agg"
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="backslashreplace"
-        )  # for a letter that the terminal does not have
+        # Characters that the terminal lacks are escaped.
+        sys.stdout.reconfigure(errors="backslashreplace")
     return run(sys.argv[1:])

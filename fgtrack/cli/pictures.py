@@ -83,7 +83,9 @@ def figure(
         if not sweeps:
             first, plans, missing = _of_runs(runs, picture, stamp, paper)
         elif len(runs) == 1 and stamp is None:
-            first, plans, missing = [], planned_sweep(read_sweep(sweeps[0])), None
+            first = []
+            plans = planned_sweep(read_sweep(sweeps[0]))
+            missing = None
         else:
             raise CallError(
                 f"{sweeps[0]}: is a sweep, give it alone and without --stamp"

@@ -68,7 +68,8 @@ def tune(
     shown = {"parameters": _parameters(report.parameters)}
     if report.held_out is not None:
         shown["held_out"] = _validation(report.held_out)
-    tables, result = Tables(shown), _sensors(report)
+    tables = Tables(shown)
+    result = _sensors(report)
     # Maps from the command line belong to these recordings, so the output does not contain them.
     tuned_config = replace(report.config, map=read_config(config_file).map)
     title = f"Noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."

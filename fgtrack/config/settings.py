@@ -120,12 +120,16 @@ class EgoConfig:
     immediately, the pose is extrapolated.
     """
     accel_std_mps2: PositiveFloat = 1.0
-    """Standard deviation of the ego's acceleration, with which the uncertainty of an extrapolated pose grows.
+    """Standard deviation of the ego's acceleration, with which the speed's uncertainty grows in an extrapolated pose.
 
     It is used until the ego's states allow an estimate.
     """
     yaw_accel_std_radps2: PositiveFloat = 0.1
-    """Standard deviation of the ego's yaw acceleration, used as `accel_std_mps2`."""
+    """Standard deviation of the ego's yaw acceleration, with which the yaw's uncertainty grows in an
+    extrapolated pose.
+
+    It is used until the ego's states allow an estimate.
+    """
 
     def __post_init__(self) -> None:
         fused = self.position_time_s is not None

@@ -227,7 +227,8 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
             isinstance(inside, list) and isinstance(part, int) and part < len(inside)
         )
         if is_entry or (isinstance(inside, Mapping) and part in inside):
-            names, inside = [*names, str(part)], inside[part]
+            names = [*names, str(part)]
+            inside = inside[part]
     message = first["msg"].removeprefix("Value error, ")
     given = f", not {_short(first['input'])}"
     if first["type"] == _UNKNOWN:

@@ -9,7 +9,8 @@ _LONGEST = 700
 _TAIL = 250
 #: A run of characters without a space that is longer than this keeps its two ends only.
 _LONG_WORD = re.compile(r"\S{201,}")
-_WORD_HEAD, _WORD_TAIL = 100, 60
+_WORD_HEAD = 100
+_WORD_TAIL = 60
 
 
 class FgtrackError(Exception):

@@ -41,6 +41,6 @@ def read_whole(path: Path, largest_mb: float) -> bytes:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if len(content) > largest:
         raise DataError(
-            f"{path}: is larger than {largest_mb:g} MB, so it is not a file of this kind"
+            f"{path}: is larger than {largest_mb:g} MB, more than a file of this kind has"
         )
     return content

@@ -12,7 +12,7 @@ Real = TypeVar("Real", float, FloatArray)
 
 
 def may_be_radians(least: float, most: float) -> bool:
-    """True if angles from `least` to `most` may be radians: they span one turn at most, as does each of them."""
+    """True if angles from `least` to `most` may be radians: their magnitudes and their range are one turn at most."""
     turn_rad = 2.0 * math.pi + 0.01
     return most - least <= turn_rad and max(-least, most) <= turn_rad
 
@@ -43,13 +43,15 @@ def wrap_angles(angles_rad: FloatArray) -> FloatArray:
 
 def rotation(yaw_rad: float) -> FloatArray:
     """Rotation matrix parent_from_child, shape (2, 2), of a child frame with yaw `yaw_rad` in its parent."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    c = math.cos(yaw_rad)
+    s = math.sin(yaw_rad)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(yaws_rad: FloatArray) -> FloatArray:
     """Rotation matrices parent_from_child, shape (..., 2, 2), of child frames with `yaws_rad`, shape (...)."""
-    c, s = np.cos(yaws_rad), np.sin(yaws_rad)
+    c = np.cos(yaws_rad)
+    s = np.sin(yaws_rad)
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
 
 
@@ -58,7 +60,8 @@ def in_polygon(points: FloatArray, corners: FloatArray) -> BoolArray:
 
     A point is inside if a ray from the point crosses the edges 1, 3, 5 ... times.
     """
-    x, y = points[:, :1], points[:, 1:]
+    x = points[:, :1]
+    y = points[:, 1:]
     (ax, ay), (bx, by) = corners.T, np.roll(corners, -1, axis=0).T
     crosses_y = (ay > y) != (by > y)
     crossing_x = ax + (y - ay) * (bx - ax) / np.where(ay == by, 1.0, by - ay)
@@ -72,7 +75,8 @@ def circular_mean(angles_rad: FloatArray) -> float:
 
 def polar(vector: FloatArray) -> FloatArray:
     """Direction in [-pi, pi] and length of `vector`, both of shape (..., 2); the direction of the zero vector is 0."""
-    x, y = vector[..., 0], vector[..., 1]
+    x = vector[..., 0]
+    y = vector[..., 1]
     return np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=-1)
 
 
@@ -82,9 +86,12 @@ def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
     The derivative of the direction uses `floor` for shorter vectors, because it is
     infinite at length 0.
     """
-    x, y = vector[..., 0], vector[..., 1]
-    direction, length = np.arctan2(y, x), np.maximum(np.hypot(x, y), floor)
-    c, s = np.cos(direction), np.sin(direction)
+    x = vector[..., 0]
+    y = vector[..., 1]
+    direction = np.arctan2(y, x)
+    length = np.maximum(np.hypot(x, y), floor)
+    c = np.cos(direction)
+    s = np.sin(direction)
     return np.stack(
         [np.stack([-s / length, c / length], axis=-1), np.stack([c, s], axis=-1)],
         axis=-2,
@@ -93,14 +100,17 @@ def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
 
 def cartesian(direction_length: FloatArray) -> FloatArray:
     """Vector, shape (..., 2), with the direction and (signed) length in `direction_length`, shape (..., 2)."""
-    direction, length = direction_length[..., 0], direction_length[..., 1]
+    direction = direction_length[..., 0]
+    length = direction_length[..., 1]
     return np.stack([length * np.cos(direction), length * np.sin(direction)], axis=-1)
 
 
 def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
     """Jacobian of `cartesian`, shape (..., 2, 2)."""
-    direction, length = direction_length[..., 0], direction_length[..., 1]
-    c, s = np.cos(direction), np.sin(direction)
+    direction = direction_length[..., 0]
+    length = direction_length[..., 1]
+    c = np.cos(direction)
+    s = np.sin(direction)
     return np.stack(
         [np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)],
         axis=-2,

@@ -142,7 +142,7 @@ def noise_root(Q: FloatArray) -> FloatArray:
 
 
 def regular(Q: FloatArray) -> FloatArray:
-    """Process noise (..., n, n) with a small diagonal added, so that it is never singular.
+    """Process noise (..., n, n) with a small diagonal added, which makes it regular (invertible).
 
     Each standard deviation of the addition is a millionth of the component's, and at
     least 1e-9.

@@ -196,9 +196,11 @@ class ObjectReport:
     class_share: float | None = None
     """Share of this class among the detections with a class."""
     length_m: float | None = None
-    """Mean over the detections that report it, like width and height."""
+    """Mean length, over the detections that report a length."""
     width_m: float | None = None
+    """Mean width, over the detections that report a width."""
     height_m: float | None = None
+    """Mean height, over the detections that report a height."""
     id: str | None = None
     """Most frequent identity of the detections."""
 

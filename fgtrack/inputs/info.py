@@ -70,7 +70,8 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
 
     Raises as `open_input`.
     """
-    path, given = Path(path), config or InputConfig()
+    path = Path(path)
+    given = config or InputConfig()
     kind = input_kind(path)
     used: dict[BagTopic, str] = {}
     times: dict[BagTopic, list[_Times]] = defaultdict(list)
@@ -107,7 +108,8 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
         return InputInfo(path, kind, None, 0.0, topics, problem)
-    start_ns, end_ns = min(receipts_ns), max(receipts_ns)
+    start_ns = min(receipts_ns)
+    end_ns = max(receipts_ns)
     if kind != "recording":  # a recording's log times are certainly in ns
         problem = problem or wrong_unit(len(receipts_ns), start_ns, end_ns)
     return InputInfo(path, kind, start_ns, seconds(end_ns - start_ns), topics, problem)

@@ -43,7 +43,8 @@ def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[M
     Unknown keys are ignored with one warning. Raises `TruncatedInput` after the
     messages before a break, and `DataError` for other faults.
     """
-    path, plane = Path(path), plane or LocalPlane()
+    path = Path(path)
+    plane = plane or LocalPlane()
     unknown: Counter[str] = Counter()
     with closing(_records(path)) as records:
         next(records)
@@ -244,7 +245,10 @@ def _in_plane(record: Record, plane: LocalPlane) -> Record:
 def _from_json(
     name: str, kind: type[_Made], record: object, unknown: Counter[str]
 ) -> _Made:
-    """Return an instance of `kind` from a JSON object. Null counts as missing; unknown keys are counted."""
+    """Return an instance of `kind` from the JSON object `record`.
+
+    Null counts as missing. Unknown keys are ignored and counted in `unknown`.
+    """
     if not isinstance(record, dict):
         raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")
     required = _FIELDS[kind]
@@ -262,7 +266,11 @@ def _from_json(
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return `value` with lists as tuples, and integers as floats where `key` is a real number."""
+    """Return `value` as the field `key` requires: a list becomes a tuple, an integer a float unless
+    the field is an integer.
+
+    A huge integer, which no float holds, stays.
+    """
     if type(value) is list:
         return tuple(
             [each if type(each) is float else _value(key, each) for each in value]

@@ -61,12 +61,14 @@ def replay(
         config, set, track_map=map, pit_map=pit_map, estimator=estimator
     )
     check_paths(out=out)
-    origin, kind = "", "messages"
+    origin = ""
+    kind = "messages"
     if isinstance(recording, (str, Path)):
         source = open_input(recording, resolved.input)
         resolved = assumed(resolved, source).config
         messages: Iterable[Message] = source.messages()
-        origin, kind = str(recording), source.kind
+        origin = str(recording)
+        kind = source.kind
     else:
         messages = _messages(recording)
     if out is None:

@@ -33,8 +33,11 @@ from fgtrack.sim.new_delays import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 
-SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
-PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
+SWEEP_TABLE = "sweep.csv"
+TIMING_TABLE = "timing.csv"
+ERROR_TABLE = "errors.csv"
+PAIRED_TABLE = "paired.csv"
+SUMMARY_TABLE = "summary.csv"
 _PARTS = "parts"
 _TABLES = (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE)
 PRODUCTS = (*_TABLES, _PARTS)

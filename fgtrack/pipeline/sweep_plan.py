@@ -74,7 +74,7 @@ class SweepConfig:
     scenario: str | None = None
     """Name or file of a scenario; either this or `input` is required."""
     input: str | None = None
-    """A recording, instead of a scenario."""
+    """Path of a recording, instead of a scenario."""
     delays: str | None = None
     """File with new delays by sensor for the recording (see `fgtrack convert --delays`)."""
     config: str | None = None
@@ -200,11 +200,12 @@ class Job:
     """A point of the grid and a seed: one stream, on which every estimator runs."""
 
     cells: tuple[Value, ...]
-    """Cells of the axes' columns."""
+    """Values of the point of the grid, in the order of the axes' columns."""
     seed: int
     key: str
     """Hash of everything that determines the result: settings, seed, estimators, versions, plug-ins, read files."""
     recipe: Recipe | None
+    """Everything that determines the result; None if the point of the grid cannot be run."""
     problem: str | None = None
     """Reason why the point of the grid cannot be run, if there is no recipe."""
     is_data_bad: bool = False
@@ -221,7 +222,7 @@ class Plan:
     estimators: tuple[str, ...]
     metrics: tuple[str, ...]
     inputs: tuple[Path, ...] = ()
-    """The sweep file, and the files and folders in it."""
+    """The sweep file, and the files and folders that it names."""
 
 
 def load_plan(

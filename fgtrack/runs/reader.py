@@ -221,7 +221,8 @@ def load_run(path: Path | str) -> Run:
     Raises `DataError` if a file is missing or damaged.
     """
     path = Path(path)
-    file, config = path / "meta.json", path / "config.yaml"
+    file = path / "meta.json"
+    config = path / "config.yaml"
     try:
         meta = json.loads(read_whole(file, LARGEST_META_MB))
     except (ValueError, RecursionError) as error:

@@ -62,7 +62,7 @@ class RunSink(ABC):
     def write_tick(
         self, report: TickReport, process_ns: int, num_detections: int
     ) -> None:
-        """Add the rows of one tick, as in `rows`; the rows of the first tick are appended immediately."""
+        """Add the rows of one tick to the tables, as in `rows`; the rows of the first tick are appended immediately."""
         for record in report.updates:
             self._counts[record.sensor][record.disposition] += 1
             if record.reason is not None:
@@ -85,11 +85,11 @@ class RunSink(ABC):
             self._append_rows()
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
-        """Add rows of `smoothed`, which may be none."""
+        """Add rows to the table `smoothed`; there may be none."""
         self._rows["smoothed"] += smoothed_rows(reports)
 
     def write_truth(self, truth: TruthState) -> None:
-        """Add a row of `truth`, or of `ignored` for an ignored object."""
+        """Add a row to the table `truth`, or for an ignored object to `ignored`."""
         if truth.ignored:
             outline = (
                 None
@@ -111,11 +111,11 @@ class RunSink(ABC):
             )
 
     def write_ego(self, ego: EgoState) -> None:
-        """Add a row of `ego`."""
+        """Add a row to the table `ego`."""
         self._rows["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
 
     def write_detections(self, message: DetectionList) -> None:
-        """Add the rows of `detections`, and count the objects that the reader left out."""
+        """Add rows to the table `detections`, and count the objects that the reader left out."""
         self._rows["detections"] += detection_rows(message)
         if message.origin_deg is not None:
             self._meta.setdefault(
@@ -148,7 +148,7 @@ class RunSink(ABC):
         return dict(self._meta)
 
     def _end_objects(self, alive: Set[int]) -> None:
-        """Add rows of `objects` for tracks that have ended: those not in `alive`."""
+        """Add rows to the table `objects` for tracks that have ended: those not in `alive`."""
         ended = sorted(self._objects.keys() - alive)
         self._rows["objects"] += [
             (track_id, *astuple(self._objects.pop(track_id))) for track_id in ended

@@ -111,7 +111,10 @@ class RunWriter(RunSink):
             raise write_error(folder / f"{table}.csv", error) from error
 
     def _begin(self) -> Path:
-        """Create the files at the first call, with the first tick; a run that fails earlier leaves nothing."""
+        """Return the folder of the files, which are created at the first call, with the first tick.
+
+        A run that fails before the first tick leaves nothing.
+        """
         if self._folder is None:
             folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
             if folder != self.path:

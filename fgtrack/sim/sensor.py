@@ -23,7 +23,7 @@ class Clutter:
     """False detections: a Poisson number in each scan, uniform over a region."""
 
     mean_per_scan: NonNegativeFloat = 0.0
-    """Mean number in the region, of which the visible detections are reported.
+    """Mean number of false detections in the region of a scan; only those in view are reported.
 
     The region is the field of view between the ranges or, for `track`, the track up to
     the maximum range.

@@ -171,7 +171,8 @@ class DrawnTrajectory:
 
     def states(self, times_s: FloatArray) -> FloatArray:
         """Return the states at `times_s` as `TrackVehicle.states`; the acceleration is 0, because CTRV has none."""
-        step_s, motion = self.vehicle.step_s, self.vehicle.motion
+        step_s = self.vehicle.step_s
+        motion = self.vehicle.motion
         k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
         within_s = times_s - k * step_s
         part = np.clip(within_s / step_s, 0.0, 1.0)[:, None]

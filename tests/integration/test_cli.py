@@ -400,7 +400,7 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
         (
             KeyboardInterrupt(),
             130,
-            "interrupted; what was computed so far is in the output folder",
+            "interrupted; finished results are in the output folder",
         ),
     ],
     ids=repr,

@@ -278,8 +278,7 @@ def test_ctrl_c_is_one_line_and_what_is_done_stays(
         *before, last = process.stderr.read().splitlines()
     assert process.returncode == 130
     assert (
-        last
-        == "fgtrack: error: interrupted; what was computed so far is in the output folder"
+        last == "fgtrack: error: interrupted; finished results are in the output folder"
     )
     assert all(
         line.startswith("fgtrack: sweep, ") for line in before

@@ -35,5 +35,5 @@ def test_too_little_memory_is_one_line(
     monkeypatch.setattr(fgtrack.cli.recordings, "config", exhausted)
     assert run(["config"]) == 1
     assert capsys.readouterr().err == (
-        "fgtrack: error: more memory needed than --max-memory allows: raise it, or split the input\n"
+        "fgtrack: error: more memory is needed than --max-memory allows: raise the limit, or split the input\n"
     )

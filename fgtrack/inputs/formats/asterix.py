@@ -82,19 +82,23 @@ class _Category(NamedTuple):
     """Items of a category, as number or number/part; of several the first that a record contains is read."""
 
     sensor: str
+    """Name of the sensor; empty if the type of the report determines it (`_KINDS`)."""
     stamp: tuple[str, ...]
+    """Items with the stamp."""
     receipt: tuple[str, ...]
-    """Empty if the category has no second time."""
+    """Items with the receipt; empty if the category has no second time."""
     address: str
+    """Item with the address of the target."""
     positions: tuple[tuple[str, str, str], ...]
-    """Items with two parts each: LAT and LON, X and Y, or RHO and THETA."""
+    """Items with a position, each with its two parts: LAT and LON, X and Y, or RHO and THETA."""
     velocity: tuple[str, str, str]
-    """Item with two parts: VX and VY, or speed and direction."""
+    """Item with the velocity, with its two parts: VX and VY, or speed and direction."""
     height: str
+    """Item with the flight level."""
     unit_m: float = 1.0
     """Unit of X and Y in m."""
     lsb: Mapping[str, float] = {}
-    """Least significant bits that replace wrong ones of libasterix."""
+    """Least significant bits by item/part, where libasterix has wrong ones."""
 
 
 _WGS84 = ("041", "LAT", "LON")
@@ -295,7 +299,8 @@ def _records(
     at = 0
     with open_file(file) as blocks:
         while head := blocks.read(3):
-            number, length = head[0], int.from_bytes(head[1:], "big")
+            number = head[0]
+            length = int.from_bytes(head[1:], "big")
             content = blocks.read(max(length - 3, 0))
             if len(head) < 3 or len(content) != length - 3:
                 raise TruncatedInput(f"{file}: breaks off in the block at byte {at}")
@@ -331,7 +336,8 @@ class _Site:
     def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Position in the plane, `x_m` to the east and `y_m` to the north of the station."""
         self.misplaces = not self._given
-        c, s = math.cos(self._turn_rad), math.sin(self._turn_rad)
+        c = math.cos(self._turn_rad)
+        s = math.sin(self._turn_rad)
         return self._x_m + c * x_m + s * y_m, self._y_m - s * x_m + c * y_m
 
 
@@ -371,7 +377,8 @@ def _position_m(
     site: _Site,
     plane: LocalPlane,
 ) -> tuple[float, float] | None:
-    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
+    a = record.get(f"{item}/{first}")
+    b = record.get(f"{item}/{second}")
     if a is None or b is None:
         return None
     if first == "LAT":
@@ -385,7 +392,8 @@ def _velocity(
     record: Record, item: str, first: str, second: str
 ) -> tuple[float | None, float | None]:
     """Return speed over ground and course; None if not reported. The course of an object at rest is None."""
-    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
+    a = record.get(f"{item}/{first}")
+    b = record.get(f"{item}/{second}")
     if a is None or b is None:
         return None, None
     if first == "VX":

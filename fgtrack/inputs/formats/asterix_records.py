@@ -162,7 +162,8 @@ def _end(variation: _Spec) -> _End:
     if hasattr(variation, "cv_explicit_type"):
         return lambda block, at: at + max(block[at], 1)
     if hasattr(variation, "cv_rep_bytes"):
-        width, size = variation.cv_rep_bytes, variation.cv_variation.cv_bit_size
+        width = variation.cv_rep_bytes
+        size = variation.cv_variation.cv_bit_size
         if width is None:
             return partial(_extended_end, repeat((size + 1) // 8))
         return lambda block, at: (

@@ -100,7 +100,8 @@ def _truth(file: Path) -> list[TruthState]:
             f"{file}: record {index} does not have the form of the data set"
         ):
             for fix in fixes if isinstance(fixes, list) else [fixes]:
-                stamp_ns, target = exact_ns(fix["time"]), int(fix["targetID"])
+                stamp_ns = exact_ns(fix["time"])
+                target = int(fix["targetID"])
                 north_m, east_m = map(float, fix["position"][:2])
                 state = TruthState(stamp_ns, stamp_ns, target, x_m=east_m, y_m=north_m)
                 states.setdefault((stamp_ns, target), state)

@@ -152,7 +152,10 @@ def object_list(
 
 def yaw_rad(orientation: RosMessage) -> float | None:
     """Yaw of a quaternion of any norm; None for the quaternion 0, which means that the orientation is unknown."""
-    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    x = orientation.x
+    y = orientation.y
+    z = orientation.z
+    w = orientation.w
     if x == y == z == w == 0.0:
         return None
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -102,7 +102,8 @@ def _lists(
 
 
 def _object(item: Json, frame: Frame) -> Detection:
-    keys, state = item["keys"], item["state"]
+    keys = item["keys"]
+    state = item["state"]
     # The published tracker adds the yaw from the map after logging.
     if len(state) == len(keys) - 1:
         keys = [key for key in keys if key != "yaw"]

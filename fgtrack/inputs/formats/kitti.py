@@ -210,7 +210,8 @@ FORMAT = FileFormat(
 
 def _truth(settings: KittiInput, view: View, fields: list[str]) -> TruthState | None:
     """True state of a label's object, or of an ignored region; None for classes that are not read."""
-    kind, ego = fields[2], view.ego
+    kind = fields[2]
+    ego = view.ego
     if kind == "DontCare":
         return _region(view, *map(float, fields[6:10]))
     ignored = kind in {_NEIGHBOURS.get(name) for name in settings.classes}
@@ -231,7 +232,8 @@ def _region(
     near_m = (
         _CAR_HEIGHT_M * _INSIDE * view.projection[1, 1] / max(bottom_px - top_px, 1.0)
     )
-    near_m, far_m = min(near_m, 0.5 * _FAR_M), _FAR_M
+    near_m = min(near_m, 0.5 * _FAR_M)
+    far_m = _FAR_M
     v_px = 0.5 * (top_px + bottom_px)
     sides = np.array([view.bearing_rad(u_px, v_px) for u_px in (left_px, right_px)])
     rays = np.column_stack([np.cos(sides), np.sin(sides)])

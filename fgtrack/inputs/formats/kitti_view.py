@@ -168,7 +168,8 @@ def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | Non
     """Return the ego at the frames of a sequence up to the first malformed line, and the error of this line."""
     calibration = _calibration(folder / CALIB / f"{sequence}.txt")
     views: list[View] = []
-    scale, origin_m = 1.0, np.zeros(2)
+    scale = 1.0
+    origin_m = np.zeros(2)
     try:
         for where, fields in lines_of(folder / OXTS / f"{sequence}.txt"):
             with reported_as(where):
@@ -199,7 +200,8 @@ def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | Non
                     yaw_rate_radps,
                     accel_mps2,
                 )
-                about_x, about_y = np.eye(3), np.eye(3)
+                about_x = np.eye(3)
+                about_y = np.eye(3)
                 about_x[1:, 1:] = rotation(roll_rad)
                 # Rows and columns x and z: a rotation about y turns z to x.
                 about_y[::2, ::2] = rotation(-pitch_rad)

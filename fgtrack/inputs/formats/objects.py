@@ -168,7 +168,8 @@ def radar_tracks(message: RosMessage) -> ObjectList:
 def _radar_track(item: RosMessage) -> Detection:
     from scipy.linalg import block_diag
 
-    position, velocity = item.position, item.velocity
+    position = item.position
+    velocity = item.velocity
     values = {
         "x_m": position.x,
         "y_m": position.y,
@@ -208,7 +209,8 @@ def odometry(message: RosMessage) -> ObjectList:
 
     The twist is in the object's own frame.
     """
-    pose, velocity = message.pose.pose, message.twist.twist.linear
+    pose = message.pose.pose
+    velocity = message.twist.twist.linear
     values = {
         "x_m": pose.position.x,
         "y_m": pose.position.y,
@@ -229,7 +231,8 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
 
     An unknown yaw is NaN.
     """
-    pose, twist = message.pose.pose, message.twist.twist
+    pose = message.pose.pose
+    twist = message.twist.twist
     yaw = yaw_rad(pose.orientation)
     return EgoState(
         stamp_ns(message.header.stamp),

@@ -150,7 +150,8 @@ def _read(
     ):
         return [], DataError(f"{file}: {text}: change `time_unit` (input.csv.{role})")
     for (stamp_ns, receipt_ns), objects in scans.items():
-        counted, left_out = tuple(left_out), []
+        counted = tuple(left_out)
+        left_out = []
         sensor = role.removeprefix("detections.")
         frame = table.frame or ("map" if GEODETIC[0] in table.columns else "ego")
         messages.append(

@@ -40,7 +40,8 @@ class _Values:
     """Reads the values of a message in turn; raises `struct.error` or `ValueError` if the message ends before them."""
 
     def __init__(self, data: bytes) -> None:
-        self._data, self._at = data[4:], 0
+        self._data = data[4:]
+        self._at = 0
 
     def take(self, form: Struct, size: int) -> tuple[Any, ...]:
         """Read the values of `form`; the first value has the size `size` and is aligned to it."""

@@ -112,7 +112,8 @@ class Assumed:
                 inner = inner.get(name, {})
             if path[-1] in inner:
                 inner.yaml_add_eol_comment(printable(reason), path[-1])
-        text, yaml = StringIO(), YAML()
+        text = StringIO()
+        yaml = YAML()
         yaml.width = 4096
         yaml.dump(tree, text)
         return "\n".join(

@@ -330,13 +330,15 @@ def _position(detection: Detection) -> tuple[float, float, float]:
     if detection.bearing_rad is None:
         return math.nan, math.nan, 0.0
     length = 1.0 if detection.range_m is None else detection.range_m
-    cosine, sine = math.cos(detection.bearing_rad), math.sin(detection.bearing_rad)
+    cosine = math.cos(detection.bearing_rad)
+    sine = math.sin(detection.bearing_rad)
     return length * cosine, length * sine, float(detection.range_m is not None)
 
 
 def _rotated(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
     """Return `vectors_m`, shape (n, 2), each rotated by its angle, shape (n,)."""
-    cosine, sine = np.cos(angles_rad), np.sin(angles_rad)
+    cosine = np.cos(angles_rad)
+    sine = np.sin(angles_rad)
     x_m, y_m = vectors_m.T
     return np.column_stack([cosine * x_m - sine * y_m, sine * x_m + cosine * y_m])
 

@@ -36,7 +36,7 @@ _CROWD_M = 50.0
 _CORE = 3.5
 """Largest second difference of one object's positions, in multiples of the scale: 99.8 % of a Rayleigh distribution."""
 _PROBABILITY = (0.1, 0.9)
-"""Bounds of the detection probability: it is uncertain, because an occlusion lasts for several lists."""
+"""Bounds of the estimated detection probability, which is uncertain because occlusions last for several lists."""
 
 
 class Lists(NamedTuple):
@@ -87,7 +87,8 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
     Returns None if there are few pairs, or if their distances are not clearly smaller
     than distances from a reference point next to the object.
     """
-    distances_m, beside_m = [], []
+    distances_m = []
+    beside_m = []
     for stamp_s, *state in one.lines.tolist():
         k = int(np.argmin(np.abs(other.stamps_s - stamp_s)))
         at_m = np.array(state[:2])
@@ -195,7 +196,8 @@ def _crowding_per_m2(
     """
     from scipy.spatial import cKDTree
 
-    num_loose, pairs = max(int(loose.sum()), 1), 0
+    num_loose = max(int(loose.sum()), 1)
+    pairs = 0
     for k in np.unique(numbers[loose]).tolist():
         tree = cKDTree(points_m[k][loose[numbers == k]])
         pairs += int(tree.count_neighbors(tree, _CROWD_M)) - tree.n
