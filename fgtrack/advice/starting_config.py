@@ -123,7 +123,7 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[InputPart]) -> Input
     has_clock = topic.delay is None or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
     item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
     reasons = {
-        "stamp_from": "its stamps are of another clock than the recorder's, or not set"
+        "stamp_from": "its stamps come from another clock than the recorder's, or are not set"
     }
     problem = next(
         (
@@ -193,7 +193,7 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> InputPar
         notes = _unused(values, used)
         if not (path or is_ego):
             notes += (
-                "one object per message: set scan_s to put those of a scan together",
+                "one object per message: set scan_s to combine the objects of a scan",
             )
         return InputPart(
             "ego" if is_ego else sensor, replace(item, fields=fields), reasons, notes

@@ -113,7 +113,9 @@ def streaming_tables(
         "evaluated", "judged", text=lambda name: _TITLES[str(name)], left=True
     )
     columns = [evaluated, RUN, *entry_columns("pos. [m]", "position_rmse_m")]
-    title = "Streaming accuracy (position RMSE, each run paying for its time)"
+    title = (
+        "Streaming accuracy (position RMSE, including the computing time of each run)"
+    )
     return {
         "streaming": Table(title, records, columns, ("run", "judged"), notes),
         "load": load,
