@@ -8,8 +8,9 @@ and objects without a `STATE`.
 
 import pickle
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from io import BytesIO
 from typing import Any, ClassVar, TypeVar
@@ -72,18 +73,8 @@ def copied(value: _T) -> _T:
     return value if copy is None else copy(value)
 
 
-# Any: a function for each type.
-_COPIERS = dict[type, Callable[[Any], Any] | None]()
-
-
-def _copier(kind: type) -> Callable[[Any], Any] | None:
-    """Return the function that copies objects of a type; None where they never change."""
-    if kind not in _COPIERS:
-        _COPIERS[kind] = _new_copier(kind)
-    return _COPIERS[kind]
-
-
 def _new_copier(kind: type) -> Callable[[Any], Any] | None:
+    """Return the function that copies objects of a type; None where they never change."""
     if issubclass(kind, Stateful):
         return kind.checkpoint
     if issubclass(kind, np.ndarray):
@@ -99,9 +90,18 @@ def _new_copier(kind: type) -> Callable[[Any], Any] | None:
     return None
 
 
-def _are_fixed(values: Iterable[object]) -> bool:
-    """True if none of the values can change."""
-    return all(_copier(kind) is None for kind in set(map(type, values)))
+_copier: Callable[[type], Callable[[Any], Any] | None] = cache(_new_copier)
+
+
+def _are_fixed(values: Collection[Any]) -> bool:
+    """True if none of the values can change; of tuples, none of their items."""
+    kinds = set(map(type, values))
+    if tuple in kinds:
+        kinds.remove(tuple)
+        kinds.update(
+            type(item) for each in values if type(each) is tuple for item in each
+        )
+    return all(_copier(kind) is None for kind in kinds)
 
 
 def _copied_mapping(mapping: dict[Any, Any]) -> dict[Any, Any]:
@@ -129,11 +129,14 @@ def _copied_tuple(items: tuple[Any, ...]) -> tuple[Any, ...]:
 def _record_copier(kind: type) -> Callable[[Any], Any]:
     """Return the function that copies records of a dataclass that may change."""
     names = [each.name for each in fields(kind)]
+    copier = _copier
 
     def copy(record: Any) -> Any:
         result: Any = object.__new__(kind)
         for name in names:
-            setattr(result, name, copied(getattr(record, name)))
+            value = getattr(record, name)
+            own = copier(type(value))
+            setattr(result, name, value if own is None else own(value))
         return result
 
     return copy

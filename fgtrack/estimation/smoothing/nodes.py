@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fgtrack.core.state import Snapshot, Stateful, copied_attributes
+from fgtrack.core.state import Snapshot, Stateful, copied_attributes, put_back
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
@@ -44,6 +44,9 @@ from fgtrack.models.robust import compiled_form
 from fgtrack.models.transitions import transitions
 
 _FEW_TRACKS, _FEW_NODES, _FEW_VALUES, _FEW_COMPONENTS = 4, 64, 256, 4
+
+#: Arrays with one entry for each number.
+_BY_NUMBER = ("labels", "backs", "points", "blocks", "rows", "marks", "values")
 
 
 class Nodes(Stateful):
@@ -97,14 +100,24 @@ class Nodes(Stateful):
         self._share()
 
     def checkpoint(self) -> Snapshot:
-        """See `Stateful.checkpoint`."""
+        """See `Stateful.checkpoint`; of the arrays by number it has those in use alone."""
+        used, others = self._num_numbers, set(self.STATE).difference(_BY_NUMBER)
+        by_number = {
+            name: (len(getattr(self, name)), getattr(self, name)[:used].copy())
+            for name in _BY_NUMBER
+        }
         factors = {number: own.copy() for number, own in self._factors.items()}
-        others = [name for name in self.STATE if name != "_factors"]
-        return {**copied_attributes(self, others), "_factors": factors}
+        others.remove("_factors")
+        return {**copied_attributes(self, others), **by_number, "_factors": factors}
 
     def restore(self, snapshot: Snapshot) -> None:
         """See `Stateful.restore`."""
-        super().restore(snapshot)
+        put_back(self, set(self.STATE).difference(_BY_NUMBER), snapshot)
+        for name in _BY_NUMBER:
+            size, used = snapshot[name]
+            values = np.zeros((size, *used.shape[1:]), used.dtype)
+            values[: len(used)] = used
+            setattr(self, name, values)
         self._share()
 
     def __setstate__(self, state: dict[str, Any]) -> None:  # Any: of each attribute
@@ -400,9 +413,8 @@ class Nodes(Stateful):
         used, width = self._num_numbers, self.rows.shape[1]
         while width < num_rows:
             width *= 2
-        names = ("labels", "backs", "points", "blocks", "rows", "marks", "values")
         larger = []
-        for name in names:
+        for name in _BY_NUMBER:
             values: Any = getattr(self, name)  # Any: of integers or numbers
             shape = [size, *values.shape[1:]]
             if name in ("rows", "marks", "values"):
@@ -410,6 +422,6 @@ class Nodes(Stateful):
             larger.append(np.zeros(shape, values.dtype))  # pages of used numbers alone
             part = tuple(slice(length) for length in (used, *values.shape[1:]))
             larger[-1][part] = values[:used]
-        for name, values in zip(names, larger, strict=True):
+        for name, values in zip(_BY_NUMBER, larger, strict=True):
             setattr(self, name, values)
         self._share()
