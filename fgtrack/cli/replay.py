@@ -52,7 +52,11 @@ def replay(
     settings: Settings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Replay a recording through the tracker."""
+    """Replay a recording through the tracker.
+
+    Each estimator processes the recording from its start, and its results are written
+    to a run folder.
+    """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     given = (config.estimator if estimators is None else estimators).split(",")
     names = tuple(dict.fromkeys(ESTIMATORS.resolve(name.strip()) for name in given))

@@ -120,13 +120,12 @@ class EgoConfig:
     immediately, the pose is extrapolated.
     """
     accel_std_mps2: PositiveFloat = 1.0
-    """Standard deviation of the ego's acceleration, with which the speed's uncertainty grows in an extrapolated pose.
+    """Standard deviation of the ego's acceleration, with which the speed's uncertainty grows in extrapolated poses.
 
     It is used until the ego's states allow an estimate.
     """
     yaw_accel_std_radps2: PositiveFloat = 0.1
-    """Standard deviation of the ego's yaw acceleration, with which the yaw's uncertainty grows in an
-    extrapolated pose.
+    """Standard deviation of the ego's yaw acceleration, with which the yaw's uncertainty grows in extrapolated poses.
 
     It is used until the ego's states allow an estimate.
     """

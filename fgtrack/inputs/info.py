@@ -34,9 +34,9 @@ class TopicInfo:
     delay: Mapping[str, float] | None
     """Delay from stamp to receipt: `mean_s`, `p50_s`, `p90_s` and `max_s`; None if the type has no header."""
     used_as: str | None
-    """Role of the topic in a replay with the configuration."""
+    """Role of the topic in a replay with the configuration; None if the topic is not used."""
     note: str | None
-    """Reason why the topic cannot be decoded, or a problem of its messages."""
+    """Reason why the topic cannot be decoded, or a problem of its messages; None if there is no problem."""
     late: Mapping[str, float | None]
     """Shares that are out of sequence; None for fewer than two.
 

@@ -266,10 +266,9 @@ def _from_json(
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return `value` as the field `key` requires: a list becomes a tuple, an integer a float unless
-    the field is an integer.
+    """Return `value` in the type of the field `key`: a list becomes a tuple, an integer of a real field a float.
 
-    A huge integer, which no float holds, stays.
+    A huge integer stays, because no float can represent it.
     """
     if type(value) is list:
         return tuple(

@@ -158,7 +158,7 @@ def _drive(
     origin: str,
     on_tick: Callable[[TickReport], None] = lambda report: None,
 ) -> dict[str, object]:
-    """Run `tracker` over `messages` into `writer`; return the contents of meta.json."""
+    """Run `tracker` over `messages` tick by tick, with the results to `writer`; return the contents of meta.json."""
     started_ns = perf_counter_ns()
     feed = Feed(messages, config)
     detections_received = 0

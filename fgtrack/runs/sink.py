@@ -56,7 +56,7 @@ class RunSink(ABC):
 
     @property
     def is_scored(self) -> bool:
-        """True if tracks have existence probabilities; otherwise `tracks` lacks this column."""
+        """True if tracks have existence probabilities; if False, the table `tracks` lacks this column."""
         return bool(self._meta.get("is_scored"))
 
     def write_tick(

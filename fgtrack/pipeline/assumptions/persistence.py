@@ -209,8 +209,9 @@ def _crowding_per_m2(
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
     """Range beyond which most triples are not continued; None if there is no such range.
 
-    `objects` contains the number of objects that the continuation of each triple
-    indicates.
+    `ranges_m` and `objects` describe the triples. The entry in `objects` is 0 if a
+    triple is not continued, else the number of objects that it stands for, which is
+    above 1 because of missed detections.
     """
     known = np.isfinite(ranges_m)
     order = np.argsort(ranges_m[known])
