@@ -160,7 +160,11 @@ class AsterixInput:
     editions: Mapping[int, str] = field(default_factory=dict)
     """Edition by category, `{21: "0.23"}`; by default the newest."""
     stamp: Mapping[int, str] = field(default_factory=dict)
-    """Item with the stamp, by category; by default item 073 of category 021, the reception of the position."""
+    """Item with the stamp, by category; by default the time of the position.
+
+    This is item 073 of category 021 (else 071, else 030), item 070 of category 062, and
+    item 140 of the other categories.
+    """
     receipt: Mapping[int, str] = field(default_factory=dict)
     """Item with the receipt, by category; by default item 077 of category 021, the transmission of the report.
 

@@ -90,7 +90,8 @@ def check_noise(kind: int, noise: FloatArray, n: int) -> None:
 def _angles(r: float, b: float) -> tuple[float, float]:
     """Return g(r) and g(-r), with g(r) = (exp(b r) - 1) / b, for |b| <= `MAX_RELAXATION` and 0 < r <= 1/2.
 
-    They are the sum and the difference of an even part, (cosh(b r) - 1) / b, and an odd part, sinh(b r) / b.
+    They are the sum and the difference of a symmetric part, (cosh(b r) - 1) / b, and an antisymmetric part,
+    sinh(b r) / b.
     """
     square = (b * r) * (b * r)
     even, odd = 0.0, 0.0

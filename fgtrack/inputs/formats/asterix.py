@@ -79,7 +79,7 @@ _COMMON = (
 
 
 class _Category(NamedTuple):
-    """Items of a category, as number or number/part; of several the first that a record contains is read."""
+    """Items of a category, as number or number/part; of several alternatives the first in the record is read."""
 
     sensor: str
     """Name of the sensor; empty if the type of the report determines it (`_KINDS`)."""

@@ -177,7 +177,7 @@ class _Detections:
         """
 
     def add(self, message: DetectionList) -> None:
-        """Add the detections of a list."""
+        """Add the detections of `message`."""
         index = len(self.lists) // 3
         self.lists.extend((message.stamp_ns, message.receipt_ns, len(message.objects)))
         if message.objects:
