@@ -124,7 +124,7 @@ def test_what_was_assumed_is_a_configuration_that_assumes_nothing_and_says_why(
     found = assumed(replace(config, sensors={}), source_of(lambda: lists))
     path = tmp_path / "mine.yaml"
     path.write_text(found.to_yaml())
-    assert "# assumed: usual of" in path.read_text()
+    assert "# assumed: usual for" in path.read_text()
     loaded = read_config(path)
     assert loaded == found.config
     assert assumed(loaded, source_of(lambda: lists)).assumptions == ()
@@ -173,7 +173,7 @@ def test_what_a_recording_carries_is_taken_where_the_configuration_is_open() -> 
     assert found.lines() == [
         "assumed, recording: ego.detection_origin_x_m -1.74, map.track oval (recorded)",
         "assumed, lidar: standard deviations x_m 1, y_m 1 (usual for a LiDAR or RADAR detector of cars); "
-        "mounted at 2 m, 0 m, sees 115 degrees, up to 80 m (recorded)",
+        "mounted at 2 m, 0 m, field of view 115 degrees, range 80 m (recorded)",
     ]
 
 
@@ -321,8 +321,8 @@ def test_bearings_alone_are_left_out_beside_positions_unless_their_mount_is_reco
     source = source_of(lambda: [message(POINT, sensor="lidar"), bearing])
     found = assumed(Config(), source)
     assert set(found.config.used_sensors) == {"lidar"}
-    assert "camera left out" in found.lines()[-1]
-    assert found.to_yaml().count("# assumed: gives no position") == 1
+    assert "camera ignored" in found.lines()[-1]
+    assert found.to_yaml().count("# assumed: no positions") == 1
     assert set(assumed(Config(), source_of(lambda: [bearing])).config.used_sensors) == {
         "camera"
     }
