@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fgtrack.cli.main import app
-from fgtrack.clocks.arrivals import arrivals_of, overtaken, window_findings
+from fgtrack.clocks.arrivals import arrivals_of, overtaken_shares, window_findings
 from fgtrack.clocks.stamps import stamp_findings
 from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList
@@ -97,7 +97,7 @@ def test_what_comes_at_once_is_not_late(tmp_path):
 
 def test_the_lists_of_advise_count_both_meanings():
     arrivals = arrivals_of(GIVEN)
-    assert overtaken(arrivals, ["adsb"])["adsb"] == pytest.approx(3 / 5)
+    assert overtaken_shares(arrivals, ["adsb"])["adsb"] == pytest.approx(3 / 5)
     assert arrivals["adsb"].object_late == pytest.approx(1 / 3)
     assert (
         arrivals_of([listed(10, 5, None), listed(20, 6, None)])["adsb"].object_late
