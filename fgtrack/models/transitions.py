@@ -598,6 +598,18 @@ def _num_parts(x: FloatArray, t: float, noise: FloatArray) -> float:
     return math.ceil(parts) if parts < MAX_PARTS else math.inf
 
 
+@inlined
+def _counted_s(n: int, t: float, noise: FloatArray) -> float:
+    """Return the duration t, limited to half of `MAX_PARTS` parts of a yaw rate that relaxes.
+
+    The yaw rate has relaxed to zero long before, and the object may be anywhere. So years give a finite state.
+    """
+    longest = 0.5 * MAX_PARTS * MAX_RELAXATION
+    if abs(noise[n] * t) <= longest:
+        return t
+    return math.copysign(longest / noise[n], t)
+
+
 @shared(f"void(int64, {_TYPES})")
 def transition(
     kind: int,
@@ -612,6 +624,7 @@ def transition(
     if kind == LINE:
         _line(x, t, noise, mean, F, Q)
         return
+    t = _counted_s(len(x), t, noise)
     parts = _num_parts(x, t, noise)
     if parts <= MAX_PARTS:
         _arc(kind, x, t / parts, int(parts), noise, mean, F, Q)

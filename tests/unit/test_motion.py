@@ -324,6 +324,16 @@ def test_a_birth_at_rest_is_as_uncertain_across_its_heading_as_the_product_of_ya
     )
 
 
+@pytest.mark.parametrize("model", [CTRV(), CT()], ids=["ctrv", "ct"])
+def test_a_state_that_is_predicted_over_years_is_finite(model: MotionModel) -> None:
+    x = np.array([1.0, 2.0, 3.0, 4.0, 0.0])
+    mean, F, Q = model.transition(x, 1.6e9)
+    assert np.isfinite(mean).all()
+    assert np.isfinite(F).all()
+    assert np.linalg.eigvalsh(Q)[0] > 0.0
+    assert Q[0, 0] > 1e6**2
+
+
 class Accelerating(CV):
     """Constant acceleration."""
 
