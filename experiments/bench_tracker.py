@@ -70,7 +70,9 @@ class Cell:
                 for name in ("lidar_cluster", "radar")
             }
         own |= {"map.track": "oval", "map.pit": "oval"}
-        return Config.from_yaml(self.config).replace(own, estimator=self.estimator)
+        if self.estimator is not None:
+            own["estimator"] = self.estimator
+        return Config.from_yaml(self.config).replace(own)
 
 
 @dataclass(frozen=True)

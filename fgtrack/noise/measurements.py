@@ -31,10 +31,17 @@ from fgtrack.tracking.association import (
     Likely,
 )
 from fgtrack.tracking.detections import PosedBatch
+from fgtrack.tracking.ego.trajectory import EgoPose
 from fgtrack.tracking.facing import SIGNED, Facings
 from fgtrack.tracking.guarded_bank import GuardedBank
+from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess, Preprocessed
+from fgtrack.tracking.preprocess import (
+    Candidate,
+    Candidates,
+    Preprocessed,
+    Preprocessing,
+)
 from fgtrack.tracking.tracker import TrackerParts
 
 _GATE_PROBABILITY = 0.9999
@@ -171,21 +178,27 @@ class _WideGate:
         return np.asarray(away_m * math.sqrt(measurement.R[k, k]))
 
 
-class _RecordingPreprocess(Preprocess):
+class _RecordingPreprocess:
     """Preprocessing that remembers the sensor and the noise source of each measurement.
 
     It remembers the newest batches only.
     """
 
-    def __init__(self, original: Preprocess) -> None:
-        self.__dict__.update(vars(original))
+    def __init__(self, original: Preprocessing) -> None:
+        self._original = original
         # By the identity of the pose (one object per batch) and the content of the measurement:
         # sensor name, sensor model, and True if the covariance is reported by a detection.
         self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}
 
+    def posed(
+        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
+    ) -> PosedBatch:
+        """See `Preprocess.posed`."""
+        return self._original.posed(batch, sensor, ego)
+
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """See `Preprocess.together`."""
-        result = super().together(batches)
+        result = self._original.together(batches)
         self._own = {}
         for (batch, sensor, _, pose), (candidates, _) in zip(
             batches, result, strict=True

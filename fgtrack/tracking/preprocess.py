@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -237,6 +237,18 @@ class Candidates(Lazy[Candidate]):
 
 Preprocessed = tuple[Candidates, list[UpdateRecord]]
 """Candidates in the order of the merge, and the records of detections that are out of bounds."""
+
+
+class Preprocessing(Protocol):
+    """Step of a tracker that turns detections into candidates; `Preprocess` is the step of the paper."""
+
+    def posed(
+        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
+    ) -> PosedBatch:
+        """See `Preprocess.posed`."""
+
+    def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
+        """See `Preprocess.together`."""
 
 
 class Preprocess:

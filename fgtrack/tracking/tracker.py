@@ -72,7 +72,12 @@ from fgtrack.tracking.lives.counters import Scan
 from fgtrack.tracking.lives.existence import Lifecycle, after_jumps, explained
 from fgtrack.tracking.lives.latency import FOREVER, NEVER, Delays, Watermarks
 from fgtrack.tracking.objects import Apart, Evidence, Objects
-from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
+from fgtrack.tracking.preprocess import (
+    Candidates,
+    Group,
+    Preprocessed,
+    Preprocessing,
+)
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 from fgtrack.tracking.tracker_state import TrackerState
 
@@ -89,7 +94,7 @@ class TrackerParts:
     sensors: Mapping[str, SensorModel]
     ego: EgoTrajectory
     inbox: Inbox
-    preprocess: Preprocess
+    preprocess: Preprocessing
     association: Association
     bank: GuardedBank
     motion: MotionModel

@@ -191,17 +191,20 @@ class CountingLifecycle(Stateful):
 
     def _change(self, lives: Iterable[Life], stamp_ns: int, increment: int) -> None:
         """Change counters at the stamp of a list: by order of arrival, or from there on by order of stamps."""
-        change = stamp_ns, -increment
+        change, awaits = (stamp_ns, -increment), self._awaits
+        most = self._rules.counter_cap
         for life in lives:
-            if self._awaits:
-                if life.changes and change < life.changes[-1]:
+            if awaits:
+                changes = life.changes
+                if changes and change < changes[-1]:
                     self._recount(life, change)
                     continue
-                life.changes.append(change)
+                changes.append(change)
                 if life.ends_ns != FOREVER:
                     continue
-            life.counter = self._counted(life.counter, increment)
-            if self._awaits and life.counter <= 0:
+            counter = life.counter + increment
+            life.counter = most if increment >= 0 and counter > most else counter
+            if awaits and life.counter <= 0:
                 life.ends_ns = stamp_ns
 
     def _recount(self, life: Life, change: tuple[int, int]) -> None:
