@@ -131,7 +131,7 @@ def test_it_ends_with_means_and_standard_errors(
     assert (
         shown.index("worse")
         < shown.index("Summary")
-        < shown.index("every metric: --all")
+        < shown.index("all metrics: --all")
     )
     assert run(["sweep", str(smoke), "-o", str(done), "--format", "md"]) == 0
     assert capsys.readouterr().out.startswith("### Summary")

@@ -169,7 +169,7 @@ one_at_a_time:
         ),
         (
             "vary: {scenario.sensors.lidr.rate_hz: [5.0]}",
-            "lidr.rate_hz: there is no 'lidr' among 2 entries",
+            "lidr.rate_hz: there is no entry 'lidr' among 2",
         ),
     ],
 )
