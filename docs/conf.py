@@ -10,6 +10,7 @@ os.environ["PYTHONPATH"] = str(ROOT)
 
 import fgtrack  # noqa: E402
 
+suppress_warnings = ["ref.python"]  # annotations with Discriminator("kind") name the field of several classes
 project = "fgtrack"
 author = "fgtrack contributors"
 release = fgtrack.__version__

@@ -239,6 +239,9 @@ def _autodoc(name: str, value: Any) -> str:
         own = [one for one in value.__all__ if one not in dir(fgtrack)]  # a public name has an entry of its own
         members = {one: getattr(value, one) for one in own}
         return "\n\n".join(_autodoc(f"{name}.{one}", member) for one, member in members.items() if callable(member))
+    if getattr(get_origin(value), "__name__", "") == "ndarray":
+        numbers = get_args(get_args(value)[1])[0].__name__
+        return f".. py:data:: fgtrack.{name}\n\n   Type of a NumPy array of `{numbers}`."
     if callable(value):
         return f".. autofunction:: fgtrack.{name}"
     return f".. py:data:: fgtrack.{name}\n\n   " + " or ".join(f"`{one.__name__}`" for one in get_args(value))

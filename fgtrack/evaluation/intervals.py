@@ -89,7 +89,7 @@ def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
     To first order, tick t adds x_t to the statistic; these numbers are correlated. The
     variance of their sum is the mean of 2 (sum of x_t cos(pi j (t + 1/2) / n))^2 over j
     = 1 ... B (equal-weighted cosines). The interval uses Student's t with B degrees of
-    freedom. B is a fifth of the number of `correlation_length`s in the run, and at
+    freedom. B is a fifth of the number of correlation lengths (`correlation_length`) in the run, at
     least 4. So the spectrum is flat over these frequencies. The interval is unknown for
     fewer than eight ticks.
 

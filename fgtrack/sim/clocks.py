@@ -62,7 +62,7 @@ class ArrivalClock:
     kind: Literal["arrival"] = "arrival"
 
 
-#: Any clock model, selected by `kind`.
+#: Any clock model, selected by its kind.
 AnyClock = Annotated[
     OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
     Discriminator("kind"),

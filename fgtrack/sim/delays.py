@@ -132,7 +132,7 @@ class MarkovTimeDelay:
     kind: Literal["markov_time"] = "markov_time"
 
 
-#: Any delay model, selected by `kind`.
+#: Any delay model, selected by its kind.
 AnyDelay = Annotated[
     NoDelay
     | ConstantDelay

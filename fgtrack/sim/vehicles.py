@@ -183,7 +183,7 @@ class DrawnTrajectory:
         return states
 
 
-#: Any vehicle, selected by `kind`.
+#: Any vehicle, selected by its kind.
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
 
 
