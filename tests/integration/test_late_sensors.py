@@ -354,7 +354,7 @@ def test_an_estimator_with_a_shorter_memory_than_a_delay_warns_once(
         found = tracker.warnings
         assert found == tracker.warnings
         assert [
-            (f"{key} {reach_s:g} s" in one, "s1: " in one, "2.6 s" in one)
+            (f"{key} ({reach_s:g} s)" in one, "s1: " in one, "2.6 s" in one)
             for one in found
         ] == ([(True,) * 3] * is_warned)
         assert bool(tracker.counts["s1"].get("too_old")) is is_warned

@@ -73,7 +73,7 @@ def test_the_file_holds_the_configuration_with_other_noise(written: Path) -> Non
         == before
     )
     text = written.read_text(encoding="utf-8")
-    assert text.startswith("# The noise of open_space, fitted to ")
+    assert text.startswith("# Noise of open_space, fitted to ")
     assert "lidar_cluster x_m" in text
 
 

@@ -24,10 +24,10 @@ REFUSED = (UpdateStatus.TOO_OLD,)
 LATE = (UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
 
 
-def measured(stamp_s: float) -> Measurement:
+def measured(stamp_s: float, error_m: float = 0.0) -> Measurement:
     return Measurement.of(
         round(stamp_s * NS_PER_S),
-        x_m=5.0 * stamp_s,
+        x_m=5.0 * stamp_s + error_m,
         y_m=0.1 * np.sin(7.0 * stamp_s),
         std=0.3,
     )
@@ -70,7 +70,7 @@ def test_a_smoother_refuses_only_what_is_older_than_its_ring(
         begin_ns, _ = one.window_ns
         start_ns = begin_ns + round(ring_s * NS_PER_S)
         stamp_ns = measured(stamp_s).stamp_ns
-        status = one.update(measured(stamp_s)).status
+        status = one.update(measured(stamp_s, 1e-3 * k)).status  # no two are identical
         if stamp_ns < begin_ns:
             assert status is UpdateStatus.TOO_OLD
         elif stamp_s >= newest_s:

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.iekf import IekfReplay, negative_log_posterior
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
@@ -29,8 +30,11 @@ def seen(loss: RobustLoss | None = None) -> Measurement:
 
 
 FILTERS: dict[str, Any] = {
-    name: estimator(f"{name}-replay", MOTION, START)
-    for name in ("ekf", "iekf", "ukf", "iplf")
+    "ekf": ReplayEkf(MOTION, START, 1.0),
+    **{
+        name: estimator(f"{name}-replay", MOTION, START)
+        for name in ("iekf", "ukf", "iplf")
+    },
 }
 
 

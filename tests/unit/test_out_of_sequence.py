@@ -56,7 +56,9 @@ def test_wrong_stamps_are_left_out_of_delays_and_advice(tmp_path):
     assert topic.delay == pytest.approx(
         dict.fromkeys(("mean_s", "p50_s", "p90_s", "max_s"), 0.04)
     )
-    assert topic.note.startswith("10 stamps are more than an hour")
+    assert topic.note.startswith(
+        "10 stamps differ from their receipt by more than an hour"
+    )
     (one,) = arrivals_of(given).values()
     assert one.quantile_s(0.999) == pytest.approx(0.04)
     (found,) = [each for each in stamp_findings(one) if "an hour" in each.text]
@@ -155,5 +157,5 @@ def test_reports_of_several_objects_have_no_period_by_which_some_were_lost():
     ]
     reports = [listed(at + 10, at, "AB"[at // 1000 % 2]) for at in whole_seconds]
     arrivals = arrivals_of([*periodic, *reports])
-    assert arrivals["radar"].lost == pytest.approx(0.2, abs=0.02)
-    assert arrivals["adsb"].lost is None
+    assert arrivals["radar"].lost_share == pytest.approx(0.2, abs=0.02)
+    assert arrivals["adsb"].lost_share is None
