@@ -228,10 +228,11 @@ def test_files_named_on_the_pages_for_developers_exist(page: str) -> None:
         r"`((?:fgtrack|tests|docs|\.ci)/[\w/.]*|CHANGELOG\.md)`", prose(Path(page))
     ):
         assert (ROOT / name).exists(), f"{page}: {name} does not exist"
-    for file, test in re.findall(
+    for files, test in re.findall(
         r"^\| [^|]+ \| `(.+)` \| `(.+)` \|$", prose(Path(page)), re.MULTILINE
     ):
-        assert (ROOT / "fgtrack" / file).exists(), f"{page}: {file} does not exist"
+        for file in files.split("`, `"):
+            assert (ROOT / "fgtrack" / file).exists(), f"{page}: {file} does not exist"
         assert (ROOT / "tests" / test).exists(), f"{page}: {test} does not exist"
 
 
