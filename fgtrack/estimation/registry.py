@@ -15,6 +15,7 @@ from fgtrack.core.plugins import Alias, Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.track_initiation import initiated
+from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.object_bank import ObjectBank, SingleObject
 from fgtrack.models.motion import MotionModel
 
@@ -170,7 +171,10 @@ def estimator(
         raise CallError(
             f"lag_s: must be a number, finite and not negative, is {lag_s!r}"
         )
-    return start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
+    one = start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
+    if isinstance(one, WindowedFilter):
+        one.refuses_repeated = True
+    return one
 
 
 def start_estimator(

@@ -12,7 +12,7 @@ import fgtrack
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, UpdateStatus
 from fgtrack.estimation.object_bank import SingleObject
-from fgtrack.estimation.registry import ESTIMATORS, estimator
+from fgtrack.estimation.registry import ESTIMATORS, estimator, estimator_bank
 from fgtrack.estimation.smoothing.window import Window
 from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -272,6 +272,18 @@ def test_an_identical_measurement_is_fused_once(name: str) -> None:
     np.testing.assert_array_equal(after.covariance, before.covariance)
     other = replace(measurements[3], z=measurements[3].z + 1e-3)
     assert one.update(other).status is UpdateStatus.OUT_OF_SEQUENCE
+
+
+@pytest.mark.parametrize("name", [*SMOOTHERS, "ekf-replay", "imm-replay", "asd"])
+def test_a_tracker_fuses_equal_values_of_two_sensors(name: str) -> None:
+    measurements = stream(CV())
+    bank = estimator_bank(name, CV(), 1.0, {})
+    bank.advance(START.stamp_ns)
+    bank.birth(0, START)
+    bank.advance(measurements[0].stamp_ns)
+    for _ in range(2):
+        (result,) = bank.update(measurements[0].stamp_ns, [0], [measurements[0]])
+        assert result.status is UpdateStatus.IN_SEQUENCE
 
 
 # Names

@@ -31,6 +31,9 @@ class WindowedFilter(Stateful, ABC):
         "_newest_ns",
     )
 
+    refuses_repeated = False
+    """True if an identical measurement is a duplicate. A bank fuses it: two sensors may measure the same values."""
+
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._lag_ns = nanoseconds(lag_s)
@@ -50,7 +53,7 @@ class WindowedFilter(Stateful, ABC):
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
-        if self._has_fused(measurement):
+        if self.refuses_repeated and self._has_fused(measurement):
             return UpdateResult(UpdateStatus.DUPLICATE)
         try:
             result = self._fuse(measurement.seen_by(self._motion))
