@@ -60,7 +60,7 @@ class Association(Protocol):
 
     @property
     def reads_yaws(self) -> bool:
-        """True if its gate is a likelihood, in which a yaw may be half a turn off."""
+        """True if the gate is a likelihood; only such a gate can read a yaw that is half a turn off."""
 
     def __call__(
         self,
@@ -70,18 +70,20 @@ class Association(Protocol):
         likely: Likely | None = None,
         facings: Facings | None = None,
     ) -> Assignment:
-        """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made.
-        `likely` selects pairs with costs NIS + log det S; the others are not made. Distances are no such costs.
-        Without `facings` every yaw is taken as it is.
+        """Assign candidates to tracks, whose states are at the candidates' stamp.
+
+        Pairs that are `apart` are excluded. `likely` selects pairs by their costs NIS + log det S; an association by
+        distance ignores it. Without `facings` every yaw is taken as measured.
         """
 
 
 @settings
 class GatedEuclidean:
-    """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment.
-    `max_nis` is for what the distance does not show, as a ghost that crosses a track at another speed: a pair whose
-    innovation is larger is out as well, and the candidate starts no track, which would compete for the next detections.
-    Without it, as in the paper, every pair inside the gate is accepted.
+    """Hungarian assignment on distances; the gate excludes pairs before the assignment.
+
+    `max_nis` excludes pairs by their innovation as well, for instance a ghost that crosses a track at another speed. An
+    excluded candidate starts no track, because that track would compete for the next detections. Without `max_nis`
+    every pair inside the gate is accepted, as in the paper.
     """
 
     kind: Literal["euclidean"] = "euclidean"
@@ -145,8 +147,9 @@ class GatedEuclidean:
 @settings
 class GatedMahalanobis:
     """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
-    The gate widens with the time since the last detection and the speed that is possible, so that it serves sensors of
-    any rate; the log-determinant in the cost keeps a track of wide covariance from taking what fits another.
+
+    The gate grows with the predicted covariance, so it serves sensors of any rate. The cost contains the
+    log-determinant. So a track with a large covariance does not take a detection that fits another track better.
     """
 
     kind: Literal["mahalanobis"] = "mahalanobis"
@@ -247,7 +250,7 @@ def claimed(
 
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
-    """Return `assignment` in which those of `suspects` without a track start none."""
+    """Return `assignment` in which `suspects` without a track start no track."""
     if suspects.isdisjoint(assignment.new):
         return assignment
     refused = tuple([i for i in assignment.new if i in suspects])
@@ -311,7 +314,10 @@ def _compete(i: list[int], j: list[int]) -> bool:
 
 
 def _uncontested(i: IntArray, j: IntArray, cost: FloatArray) -> BoolArray:
-    """True of all pairs, but of an i with several j that no other i may take only of the cheapest one, shape (m,)."""
+    """Mask (m,) of the pairs that an assignment may need.
+
+    A candidate i may have several tracks j that no other candidate can take. Of these pairs the cheapest is kept.
+    """
     shared, order = np.bincount(j)[j] > 1, np.lexsort((cost, i))
     cheapest = np.ones(len(i), dtype=bool)
     cheapest[order[1:]] = i[order[1:]] != i[order[:-1]]
@@ -348,8 +354,8 @@ def near(
     excluded: Apart | None = None,
 ) -> Pairs:
     """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
-    Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
-    bearing is from the track to the line of sight.
+    A candidate keeps its `MOST_NEAR` nearest tracks. Distances are in the map; the distance of a bearing is from the
+    track to the line of sight.
     """
     limits_m = np.empty(len(means))
     limits_m[:] = reach_m

@@ -107,7 +107,7 @@ class Birth:
 
 
 def _crosses(measurement: Measurement, R: FloatArray) -> dict[str, Any]:
-    """Return the cross-covariances of a `Start` with what the measurement of covariance R, shape (k, k), measures.
+    """Return the cross-covariances of a `Start` between its position and the other measured components.
 
     The position is a function of z. Its covariance with a yaw or speed of the same z is G R, with the derivative G.
     """

@@ -77,7 +77,7 @@ class MapDetections(NamedTuple):
 
 
 def in_map_frame(batches: Sequence[PosedBatch]) -> MapDetections:
-    """The detections of `batches`, what their sensors measure of them, seen from their poses."""
+    """Return the detections of `batches` in the map, with the components that their sensors measure."""
     starts = [0, *accumulate([len(each.batch.indices) for each in batches])]
     numbers: list[Any] = []  # numbers or None
     columns: list[tuple[int, ...]] = []
@@ -112,8 +112,10 @@ def move_back(items: MapDetections, by_m: FloatArray) -> None:
 
 
 def merged(items: MapDetections, merge: "Merge") -> MapDetections:
-    """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
-    Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
+    """Return `items` with the detections of each object averaged, in the order of the merge; bearings alone are last.
+
+    The average has the components that all detections of the object have. If these give no position, the leading
+    detection represents the object.
     """
     bearing, apart = (
         np.isnan(items.points_m[:, 0]),
@@ -160,9 +162,10 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
 def covariances(
     items: MapDetections, k: int, rows: IntArray | slice, names: tuple[str, ...]
 ) -> FloatArray:
-    """Covariances of `names` in the map, shape (m, k, k), of the `rows` of `items`, which are of batch k.
-    A detection's own where it has one, else the sensor's R. What the map gave has the sensor's standard deviation for
-    it and is not correlated with the rest. The covariance of an average is the mean of those of its detections.
+    """Covariances of the components `names` in the map, shape (m, k, k), for the `rows` of `items` from one batch.
+
+    A detection's own covariance is used where it has one, else the sensor's R. A component from the map has the
+    sensor's standard deviation, without correlation. An average has the mean of the covariances of its detections.
     """
     (batch, sensor, _, pose), indices, points_m = (
         items.batches[k],
@@ -212,7 +215,7 @@ def covariances(
 def _reading(
     names: tuple[str, ...],
 ) -> tuple[Callable[[Detection], Any], tuple[int, ...]]:
-    """Return what reads the components `names` of a detection, a tuple, and their columns, followed by -1."""
+    """Return a function that reads the components `names` of a detection, and their columns, filled up with -1."""
     columns = [*map(COMPONENTS.index, names), *[-1] * (len(COMPONENTS) - len(names))]
     read = attrgetter(*names)
     return read if len(names) > 1 else lambda detection: (read(detection),), tuple(
@@ -230,9 +233,10 @@ def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
 
 
 class PoseError(NamedTuple):
-    """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
-    e is the estimated pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
-    batch. It enters z where the detection was placed in the map by the pose, and h where it is relative to the sensor.
+    """Error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
+
+    e is the estimated minus the true pose (x, y, yaw, vx, vy of the sensor). All detections of a batch share it. It
+    enters z where the pose placed the detection in the map, and h where the measurement is relative to the sensor.
     """
 
     covariance: FloatArray
@@ -243,7 +247,7 @@ class PoseError(NamedTuple):
     """Covariances of the detections themselves, without e, shape (m, k, k)."""
 
     def at(self, rows: IntArray | list[int]) -> "PoseError":
-        """Return that of some detections."""
+        """Return the pose error of the detections in `rows`."""
         return PoseError(self.covariance, self.placement[rows], self.R[rows])
 
     def noise(

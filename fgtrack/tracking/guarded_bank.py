@@ -30,11 +30,12 @@ _T = TypeVar("_T")
 
 
 class GuardedBank(Stateful):
-    """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
-    Where it is unknown which track failed, all tracks of that call end. A track whose state is known to be as before
-    goes on (`EstimatorError.unchanged`). A `DataError` is an answer, not a failure, and propagates; so does a
-    `CallError` until a first track could be started: the estimator cannot be made as it is configured. `make` gives an
-    empty bank.
+    """Bank whose failures end the failing track alone.
+
+    A track ends when its estimator raises, and when its state cannot be published (see `faults`). If the failing track
+    is unknown, all tracks of the call end. A track with an unchanged state goes on (`EstimatorError.unchanged`). A
+    `DataError` is an answer, not a failure, and propagates. A `CallError` propagates until a first track has started:
+    it means that the configured estimator cannot be made. `make` returns an empty bank.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -78,7 +79,7 @@ class GuardedBank(Stateful):
         return tuple(self._alive)
 
     def holds(self, track_id: int) -> bool:
-        """Return True if there is such a track; the cost does not depend on their number."""
+        """Return True if the track exists. The cost does not depend on the number of tracks."""
         return track_id in self._alive
 
     def advance(self, now_ns: int) -> None:
@@ -128,8 +129,9 @@ class GuardedBank(Stateful):
         track_ids: Sequence[int],
         measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
-        """See `TrackBank.update`; a measurement whose update raises has failed, and so has one of an ended track.
-        What propagates, and an interrupt, leaves states unknown, so it ends the tracks of the call as well.
+        """See `TrackBank.update`. A measurement has failed if its update raises, or if its track has ended.
+
+        A propagated exception and an interrupt leave states unknown, so they end all tracks of the call.
         """
         ids = [track_id for track_id in track_ids if track_id in self._alive]
         given = set(ids)
@@ -185,7 +187,7 @@ class GuardedBank(Stateful):
         return dict(zip(track_ids, results, strict=True))
 
     def birth(self, track_id: int, prior: Start) -> None:
-        """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
+        """See `TrackBank.birth`. A track whose start fails does not exist afterwards."""
         self._alive[track_id] = None
         try:
             self._bank.birth(track_id, prior)
@@ -307,9 +309,10 @@ _KINDS = Failure.NOT_FINITE, Failure.NOT_DEFINITE  # as the kernel numbers them
 
 
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
-    """Return the faults of kinematic states by their index; nothing where all can be published.
-    A state is sound where it is finite, its entries sum up to at most 10^9, and its covariance is symmetric and
-    positive definite: up to rounding, as an entry that the motion model does not have is 0 with variance 0.
+    """Return the faults of kinematic states by their index; empty if all states can be published.
+
+    A sound state is finite, its entries sum up to at most 10^9, and its covariance is symmetric and positive definite.
+    Definiteness is checked up to rounding, because an entry that the motion model lacks is 0 with variance 0.
     """
     if not states:
         return {}

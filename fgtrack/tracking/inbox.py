@@ -337,7 +337,7 @@ class Inbox(Stateful):
 
     @property
     def held_ns(self) -> int:
-        """Oldest stamp of what `collect` has not returned; `FOREVER` where there is nothing."""
+        """Oldest stamp of the batches that `collect` has not returned; `FOREVER` if there are none."""
         return min((batch.stamp_ns for batch in self._pending), default=FOREVER)
 
     def collect(
@@ -345,8 +345,9 @@ class Inbox(Stateful):
     ) -> list[Batch]:
         """Return everything received and not yet returned, oldest stamp first.
 
-        `waits` is asked about batches at the tick `now_ns`. A batch that waits stays here until the next call. With it
-        stay all batches of its message, by which together tracks are missed, and what its sensor has stamped later.
+        `waits` is called for each batch at the tick `now_ns`. A waiting batch stays in the inbox until the next call.
+        All batches of the same message stay too, because a message misses tracks as a whole. Later batches of the same
+        sensor stay as well.
         """
         if not self._pending:
             return []

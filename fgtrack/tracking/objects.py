@@ -82,9 +82,11 @@ class Evidence:
 
 
 class Objects(Stateful):
-    """Class, identity and size of each track, and the pairs that they exclude.
-    A detection with a class may only belong to a track of its class, which is that of most of its detections, or of
-    one like it; one without a class to any. Identities are evidence, see `Evidence`.
+    """Class, identity and size of each track, and the pairs of detections and tracks that they exclude.
+
+    The class of a track is the class of most of its detections. A detection with a class may belong to a track of the
+    same or a similar class. A detection without a class may belong to any track. Identities are evidence, see
+    `Evidence`.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -193,8 +195,10 @@ class Objects(Stateful):
         return count <= _MOST_STRAYS
 
     def former(self, detection: Detection) -> int | None:
-        """Return the track, ended or lost, of which a new one of `detection` takes the number; None without any.
-        An identity is that of one object: what returns with it after a gap, or elsewhere, is the same object.
+        """Return the ended or lost track with the identity of `detection`; None if there is no such track.
+
+        A new track takes its number, because an identity belongs to one object. After a gap, or at another position,
+        the identity still means the same object.
         """
         lost = min(self._owners.get(detection.id or "", ()), default=None)
         return self._former.pop(detection.id or "", None) if lost is None else lost

@@ -133,9 +133,9 @@ def check_sensor(name: str, sensors: Mapping[str, SensorModel]) -> None:
 class Tracker:
     """Tracks objects from object lists that arrive late.
 
-    Messages come in through `receive` in receipt order; `tick` processes what came in since the last one.
-    Every detection received ends in exactly one record of exactly one tick. After an exception, or an interrupt, the
-    next tick goes on: it reports what was processed, and processes what was not.
+    `receive` takes messages in the order of receipt. `tick` processes all messages that were received since the last
+    tick. Every received detection ends in exactly one record of exactly one tick. The tick after an exception or an
+    interrupt reports the batches that were processed, and processes the rest.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -433,7 +433,7 @@ class Tracker:
     def _process_if_possible(
         self, posed: PosedBatch, preprocessed: Preprocessed | None
     ) -> None:
-        """Process a batch, the first that waits; after an exception or an interrupt, the rest of it ends as failed."""
+        """Process the first waiting batch; after an exception or interrupt its remaining detections end as failed."""
         self._begun = len(self._records), posed.batch
         with self._guarded_list:
             try:
@@ -668,9 +668,10 @@ class Tracker:
     def _unclaimed(
         self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt
     ) -> list[int]:
-        """Return those of `new` that belong to no track which began after the batch's stamp.
-        The detection that started it has overtaken them. They are too old for it, and not another object. Compared are
-        the present states of these tracks, moved back to the stamp.
+        """Return the indices of `new` candidates that belong to no track which began after the batch's stamp.
+
+        Such a track was started by a newer detection that arrived earlier. Its candidates are too old for it, and are
+        no new object. The candidates are compared with the present states of these tracks, moved back to the stamp.
         """
         bank, motion = self._parts.bank, self._parts.motion
         now, back_s = (
@@ -1019,7 +1020,7 @@ class Tracker:
     def _reports(
         self, track_ids: Sequence[int], states: Sequence[TrackState]
     ) -> Callable[[], Iterable[TrackReport]]:
-        """Return what makes the reports of tracks in these `states`, with all else as it is now."""
+        """Return a factory of track reports; status, probability and counters are captured now."""
         parts = self._parts
         statuses = list(map(parts.lifecycle.status, track_ids))
         probabilities = list(map(parts.lifecycle.probability, track_ids))

@@ -29,7 +29,7 @@ _MAX_FUTURE_NS = NS_PER_S  # see `fgtrack.tracking.inbox`
 
 
 class Durations(Stateful):
-    """The newest durations of one kind. Of each fifty of them the longest one is unusual."""
+    """The newest durations of one kind. The longest of each fifty durations counts as unusual."""
 
     STATE: ClassVar[tuple[str, ...]] = (
         "arrived_ns",
