@@ -438,7 +438,9 @@ class Facing(Stateful):
 
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended, but for its last smoothed states."""
-        row = self._rows.pop(track_id)
+        row = self._rows.pop(track_id, None)
+        if row is None:
+            return  # its start was interrupted
         self._last_ids, self._least_log_odds = (), None
         self._log_odds[row] = 0.0
         self._free.append(row)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import compress
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
@@ -261,6 +262,7 @@ class GuardedBank(Stateful):
         """Return the bank's answer, when the tracks that prevent one have ended.
         Raises `MemoryError` where there is not enough for the answer, unless the question `changes` states.
         """
+        is_new = False
         while True:
             try:
                 return question(self._bank)
@@ -277,9 +279,15 @@ class GuardedBank(Stateful):
                     self._end(error.causes, Failure.ESTIMATOR_RAISED)
                 elif self._alive:
                     self._start_over(error)
-                else:
+                elif is_new:
                     text = f"the estimator fails even without tracks ({type(error).__name__}: {error})"
                     raise DataError(text) from error
+                else:
+                    is_new = True
+                    self.failures.note(error)
+                    self._bank = self._make()
+                    with suppress(Exception):  # the repeated question shows it
+                        self._bank.advance(self._now_ns)
 
     def _end(self, causes: Mapping[int, str | BaseException], failure: Failure) -> None:
         for track_id, cause in causes.items():
