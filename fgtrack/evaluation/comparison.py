@@ -144,7 +144,7 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 
 
 def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
-    """Compare `group`, runs of one recording, at the same objects and stamps."""
+    """Compare the runs of one recording in `group`, at equal objects and stamps."""
     errors = []
     for matching in (item.matching for item in group if item.matching is not None):
         errors_of = track_errors(matching)

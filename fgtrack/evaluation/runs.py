@@ -99,7 +99,7 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 
 
 def same_recording(one: Run, other: Run) -> bool:
-    """True if both runs have the same truth, and the same detections of their common sensors.
+    """True if truth and detections of the common sensors agree in both runs.
 
     Delays and stamps may differ. Without a common sensor the truth decides, without
     truth the ego, and without both the path of the recording.

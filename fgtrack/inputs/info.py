@@ -24,7 +24,7 @@ OTHER_CLOCK_S = 3600.0
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A topic of a recording; for other inputs, the messages of one sensor or kind."""
+    """A topic of a recording; for an input without topics, the messages of one sensor or kind."""
 
     name: str
     type: str

@@ -337,7 +337,7 @@ class Inbox(Stateful):
 
     @property
     def held_ns(self) -> int:
-        """Oldest stamp of the batches that `collect` has not returned; `FOREVER` if there are none."""
+        """Oldest stamp of the batches that `collect` has not returned; `FOREVER` if it has returned all."""
         return min((batch.stamp_ns for batch in self._pending), default=FOREVER)
 
     def collect(

@@ -26,7 +26,7 @@ WINDOW: Literal["window"] = "window"
 
 @dataclass(frozen=True)
 class LagMetrics:
-    """Errors of states with one lag, and of the present states of the same tracks at the same stamps."""
+    """Errors of states with one lag, and of the present states at equal tracks and stamps."""
 
     lag_s: float | Literal["window"]
     """0 for the present states, `WINDOW` for the final states."""

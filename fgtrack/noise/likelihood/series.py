@@ -105,7 +105,7 @@ class Observation:
     deviations apply.
     """
     other_errors: FloatArray
-    """Covariance of errors from other sources, such as the ego pose, shape (d, d)."""
+    """Covariance of errors from other sources, for instance the ego pose, shape (d, d)."""
 
     @property
     def tuned(self) -> bool:

@@ -162,7 +162,7 @@ def moving_rms(
 def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     """Position RMSE against the lag, a line for each run; a horizontal line for a run without lagged states.
 
-    The thin dotted line shows the present states of the same tracks at the same stamps.
+    The thin dotted line shows the present states of these tracks at equal stamps.
     The distance between the two lines is the benefit of waiting. This comparison is
     needed because a track that ended has no lagged states for its last moments. Raises
     `DataError` if no run has tracks with truth.

@@ -100,7 +100,7 @@ class IncrementalSolver(Solver):
     def restore(self, snapshot: Snapshot) -> None:
         """See `Stateful.restore`. iSAM2 cannot be copied, so each graph is made again from its window.
 
-        The new graph has the same factors, linearised at the same points, and eliminates them at once. States then
+        The new graph has equal factors and points of linearisation, and eliminates all factors at once. States then
         differ by rounding from those of the tracker that went on: less than 1e-9 standard deviations.
         """
         super().restore(snapshot)
