@@ -30,10 +30,10 @@ from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.tables import Tables, short
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.inputs.source import open_input
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.reports import open_recording
 from fgtrack.noise.measurements import MeasurementRecorder
-from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.replay import replay
 from fgtrack.runs import Run, check_run, load_run, write_metrics
 from fgtrack.show.figures.close_up import CloseUp
@@ -212,7 +212,7 @@ def study(
         check_output(settings, overwrite)
         check_output(page, overwrite)
         on_step("reading", 0.0)
-        source = open_input(source_path, resolved.input)
+        source = open_recording(source_path, resolved.input)
         readable = UntilBreak(source.messages())
         messages = list(readable)
         known = assumed(resolved, replace(source, messages=lambda: iter(messages)))

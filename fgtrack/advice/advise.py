@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
-from fgtrack.advice.input_checks import TRIAL_S, input_checks, messages_within
 from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import PairedReplay
@@ -30,11 +29,12 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.inputs.source import open_input
+from fgtrack.meaning.assumed import assumed, source_of
+from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
+from fgtrack.meaning.reports import open_recording
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
-from fgtrack.pipeline.assumptions.assumed import assumed, source_of
-from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.tracking.ego.trajectory import MAX_EXTRAPOLATION_S
@@ -83,7 +83,7 @@ def advise(
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
-    source = open_input(recording, resolved.input)
+    source = open_recording(recording, resolved.input)
     readable = UntilBreak(source.messages())
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)

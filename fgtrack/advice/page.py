@@ -10,7 +10,7 @@ from fgtrack.config.settings import Config
 from fgtrack.core.finding import Finding
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.inputs.info import OTHER_CLOCK_S
-from fgtrack.pipeline.assumptions.assumption import Assumption
+from fgtrack.meaning.assumption import Assumption
 
 __all__ = ["Advice", "rounded_ms"]
 

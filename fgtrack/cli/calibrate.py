@@ -10,15 +10,7 @@ from typing import Annotated
 from typer import Option
 
 from fgtrack.advice.advise import advise as advised
-from fgtrack.advice.input_checks import (
-    TRIAL_S,
-    counted_lines,
-    first_contents,
-    input_checks,
-    messages_within,
-)
 from fgtrack.advice.page import rounded_ms
-from fgtrack.advice.starting_config import starting_config
 from fgtrack.cli.arguments import (
     ConfigFile,
     Input,
@@ -42,9 +34,18 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.info import InputInfo, describe
-from fgtrack.inputs.source import open_input
-from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.assumptions.assumption import Assumed
+from fgtrack.inputs.settings import InputConfig
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.input_checks import (
+    TRIAL_S,
+    counted_lines,
+    first_contents,
+    input_checks,
+    messages_within,
+)
+from fgtrack.meaning.reports import open_recording, reports
+from fgtrack.meaning.starting_config import starting_config
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.replay import Feed, with_origin
 
@@ -80,7 +81,13 @@ def info(
             say(f"{write}: written; check the guesses, which are applied below")
         config_file = str(write)
     config = None if config_file is None else read_config(config_file)
-    result = describe(recording, None if config is None else config.input)
+    if config is not None:
+        result = describe(recording, config.input)
+    else:
+        tables = reports(recording)
+        result = describe(
+            recording, None if tables is None else InputConfig(csv=tables)
+        )
     topics = _topics(result, NO_VALUE if config is None else "ignored")
     effective = (config or Config()).effective
     problem = result.problem
@@ -112,7 +119,7 @@ def info(
         if config is None and suited is None:
             # Without a configuration, topics or columns may be unknown.
             with suppress(FgtrackError), progress("detections"):
-                sentences(assumed(Config(), open_input(recording)).lines())
+                sentences(assumed(Config(), open_recording(recording)).lines())
         elif config is not None and problem is None:
             problem = _try_out(recording, config)
     if problem is not None:
@@ -122,7 +129,7 @@ def info(
 def _try_out(recording: Path, config: Config) -> str | None:
     """Print the contents of the first seconds as the configuration reads them; return the recording's problem."""
     with progress("first seconds"):
-        source = open_input(recording, config.input)
+        source = open_recording(recording, config.input)
         result = assumed(config, source)
         build_road(
             result.config.map, result.config.defects
@@ -258,7 +265,7 @@ def offsets(
     Reports sensors whose offset is not identifiable.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
-    source = open_input(recording, config.input)
+    source = open_recording(recording, config.input)
     with progress("offsets"):
         result = assumed(config, source)
         readable = UntilBreak(source.messages())

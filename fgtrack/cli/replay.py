@@ -26,9 +26,9 @@ from fgtrack.evaluation.diagnostics import (
     noise_diagnostics,
     unused,
 )
-from fgtrack.inputs.source import open_input
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.reports import open_recording
 from fgtrack.pipeline import replay as pipeline
-from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.runs import load_run
 
 
@@ -65,7 +65,7 @@ def replay(
     )
     for folder in folders.values():
         check_no_overlap(folder, [recording, config_file])
-    source = open_input(recording, config.input)
+    source = open_recording(recording, config.input)
     with progress("replay") as tell:
         result = assumed(config, source)
         pipeline.replay(

@@ -13,7 +13,9 @@ from fgtrack.config.settings import Config
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.inputs.source import InputSource, open_input
+from fgtrack.inputs.source import InputSource
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.reports import open_recording
 from fgtrack.noise.likelihood.contaminated import outlier_share
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
 from fgtrack.noise.likelihood.reference import filtered, with_mixed_marked
@@ -31,7 +33,6 @@ from fgtrack.noise.parameters import (
     stamp_key,
 )
 from fgtrack.noise.stamps import StampFit, fitted_stamps, stamp_rates, with_stamps
-from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.replay import with_origin
 from fgtrack.runs import Run
 
@@ -76,11 +77,11 @@ def tune(
     cannot be read, a sensor has no model, or nothing can be fitted.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
-    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input reports an invalid path
+    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_recording reports an invalid path
     if isinstance(recordings, Sequence) and not isinstance(recordings, str):
         paths = recordings
     return tune_sources(
-        {str(path): open_input(path, resolved.input) for path in paths},
+        {str(path): open_recording(path, resolved.input) for path in paths},
         resolved,
         TuneRules(keep=tuple(keep)),
     )

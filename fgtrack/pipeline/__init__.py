@@ -1,1 +1,1 @@
-"""From a configuration and an input to a run: replay, live tracking, sweeps, and assumptions about recordings."""
+"""From a configuration and an input to a run: replay, live tracking and sweeps."""

@@ -13,10 +13,10 @@ from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.inputs.recording import Storage, check_recording, write_recording
-from fgtrack.inputs.source import open_input
 from fgtrack.inputs.validation import InvalidMessageError, validated_message
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.reports import open_recording
 from fgtrack.pipeline import replay as pipeline
-from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.runs import Run, load_run
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate as simulated
@@ -64,7 +64,7 @@ def replay(
     origin = ""
     kind = "messages"
     if isinstance(recording, (str, Path)):
-        source = open_input(recording, resolved.input)
+        source = open_recording(recording, resolved.input)
         resolved = assumed(resolved, source).config
         messages: Iterable[Message] = source.messages()
         origin = str(recording)

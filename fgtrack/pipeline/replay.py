@@ -15,7 +15,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TickReport, TruthState
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.pipeline.assumptions.assumed import assumed, is_open, source_of
+from fgtrack.meaning.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with_last
 from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run

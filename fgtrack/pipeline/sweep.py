@@ -24,8 +24,8 @@ from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.output import check_output, locked_folder, write_file
 from fgtrack.core.types import Message
-from fgtrack.inputs.source import open_input
-from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.reports import open_recording
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
 from fgtrack.runs import Run
@@ -234,7 +234,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         if recipe["recording"] is None:
             messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
         else:
-            source = open_input(recipe["recording"], config.input)
+            source = open_recording(recipe["recording"], config.input)
             delays = validate(dict[str, SensorDelays], recipe["delays"], "delays")
             messages = list(
                 redelay(source.messages(), delays, rng)[0]

@@ -16,7 +16,7 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, Message, Trut
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.inputs.source import open_input
 from fgtrack.inputs.stream import write_stream
-from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.meaning.assumed import assumed
 from fgtrack.runs import load_run
 from fgtrack.sim.new_delays import restamped
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from support.messages import drive
 from typer.testing import CliRunner
 
-from fgtrack.advice.input_checks import first_contents, input_checks
 from fgtrack.cli.main import app
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import dump, validate
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.inputs.stream import write_stream
+from fgtrack.meaning.input_checks import first_contents, input_checks
 
 CONFIG = validate(
     Config,

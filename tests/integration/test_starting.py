@@ -10,7 +10,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from support.messages import START_NS, drive, shared
 
 import fgtrack
-from fgtrack.advice.starting_config import starting_config
 from fgtrack.cli.main import run
 from fgtrack.config.reading import read_config
 from fgtrack.core.types import DetectionList, EgoState, TruthState
@@ -18,6 +17,7 @@ from fgtrack.inputs.ros.bag_writer import write_bag
 from fgtrack.inputs.settings import Field
 from fgtrack.inputs.source import open_input
 from fgtrack.inputs.stream import write_stream
+from fgtrack.meaning.starting_config import starting_config
 
 RADAR = """std_msgs/Header header
 Target[] targets

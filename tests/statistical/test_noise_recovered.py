@@ -11,10 +11,10 @@ from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.settings import Config
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message
+from fgtrack.meaning.assumed import source_of
 from fgtrack.models.motion import CTRV
 from fgtrack.noise.parameters import TuneReport
 from fgtrack.noise.tune import tune_sources
-from fgtrack.pipeline.assumptions.assumed import source_of
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter
 from fgtrack.sim.simulate import simulate

@@ -15,8 +15,8 @@ from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.inputs.recording import write_recording
 from fgtrack.inputs.settings import InputConfig, TopicInput
 from fgtrack.inputs.source import open_input
+from fgtrack.meaning.assumed import ASSUMED_STD, assumed, source_of
 from fgtrack.models.sensors import Mount, SensorModel
-from fgtrack.pipeline.assumptions.assumed import ASSUMED_STD, assumed, source_of
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.public import replay, simulate
 from fgtrack.tracking.lives.existence import ExistenceRules

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Message
+from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
 
 MS = 1_000_000
 

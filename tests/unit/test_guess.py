@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from fgtrack.inputs.guess import agreeing_with_motion, guesses, time_unit
 from fgtrack.inputs.settings import Field
+from fgtrack.meaning.guess import agreeing_with_motion, guesses, time_unit
 
 
 @pytest.mark.parametrize(

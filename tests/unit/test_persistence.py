@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.pipeline.assumptions.persistence import (
+from fgtrack.meaning.persistence import (
     Lists,
     Persistence,
     disagreement_m,

@@ -15,7 +15,7 @@ import fgtrack
 from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
 from fgtrack.core.types import Detection, DetectionList
-from fgtrack.pipeline.assumptions.assumed import assumed, source_of
+from fgtrack.meaning.assumed import assumed, source_of
 
 SECOND_NS = 10**9
 OPENSKY = (

@@ -10,13 +10,13 @@ import gzip
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from decimal import Decimal
 from functools import partial
 from io import TextIOWrapper
-from itertools import chain, islice
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -43,21 +43,15 @@ from fgtrack.inputs.formats.fields import (
 )
 from fgtrack.inputs.formats.fusiontracking import LOG_NAME
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
-from fgtrack.inputs.guess import guesses, time_unit, words_of
-from fgtrack.inputs.settings import CsvTable, FieldPath, InputConfig
+from fgtrack.inputs.settings import CsvTable, InputConfig
 from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
-from fgtrack.models.sensors import Filter
 
 _ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
 _LONGEST_HEADER = 1_000_000
-_SAMPLES = 200
 _DATE = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)Z?(\.\d+)?(?:Z|([+-]\d\d:\d\d))?"
 )
-_IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
-#: Column of Flightradar24's granular ADS-B data: P for a message with a position, N for a repeated position.
-_HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 _TIMES = ("stamp", "receipt")
 #: Components of the ego and of truth; other roles are detections.
 _NAMES = {
@@ -280,8 +274,6 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         if table is not None
     ]
     if not tables:
-        tables = reports_of(path)
-    if not tables:
         listed = "; ".join(
             f"{file.name} has {', '.join(columns)}"
             for file, columns in headers(path).items()
@@ -291,59 +283,6 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
             f"(`fgtrack info {path} --write my.yaml` guesses them)"
         )
     return partial(read_tables, tables, LocalPlane(config.origin))
-
-
-def reports_of(path: Path) -> list[tuple[Path, CsvTable, str]]:
-    """Return the table of position reports at `path` with a guessed mapping of its columns; empty if there is none.
-
-    Times, positions in the map (latitude and longitude, or east and north) and
-    identities are read. The sensor is named `adsb` or `ais` after the column of
-    identities, else `reports`. Raises `CallError` if there are several such tables.
-    """
-    tables: list[tuple[Path, CsvTable, str]] = []
-    for file, names in headers(path).items():
-        cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
-        guessed = guesses(
-            {name: _numbers(each[name] for each in cells) for name in names if name}
-        )
-        known = ("stamp", "receipt", *GEODETIC, "id")
-        columns: dict[str, FieldPath] = {
-            key: guessed[key].path for key in known if key in guessed
-        }
-        if not {*GEODETIC} <= columns.keys():
-            columns |= {
-                key: guessed[key].path for key in ("x_m", "y_m") if key in guessed
-            }
-            if not all(
-                set(words_of(str(columns.get(key, "")))) & _IN_MAP
-                for key in ("x_m", "y_m")
-            ):
-                continue
-        if "stamp" not in columns:
-            continue
-        unit, _ = time_unit(
-            str(columns["stamp"]),
-            _numbers(each[str(columns["stamp"])] for each in cells),
-        )
-        words = set(words_of(str(columns.get("id", ""))))
-        sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
-        filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
-        table = CsvTable(columns, None, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT
-        tables.append((file, table, f"detections.{sensor}"))
-    if len(tables) > 1:
-        raise CallError(
-            f"{path}: contains {len(tables)} tables of reports: give one of them, for example {tables[0][0]}, "
-            "or set input.csv"
-        )
-    return tables
-
-
-def _numbers(texts: Iterable[str]) -> list[float]:
-    numbers = []
-    for text in texts:
-        with suppress(ValueError):
-            numbers.append(float(text))
-    return numbers
 
 
 def headers(path: Path) -> dict[Path, list[str]]:

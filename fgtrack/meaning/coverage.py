@@ -21,13 +21,13 @@ from fgtrack.core.types import (
     IntArray,
     Message,
 )
-from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.assumptions.persistence import (
+from fgtrack.meaning.persistence import (
     Lists,
     Persistence,
     disagreement_m,
     persistence,
 )
+from fgtrack.models.sensors import Mount
 
 __all__ = ["Coverage", "coverages"]
 

@@ -14,9 +14,9 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.inputs.source import InputSource
+from fgtrack.meaning.assumption import Assumed, Assumption
+from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.assumptions.assumption import Assumed, Assumption
-from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.lives.existence import ExistenceRules
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from fgtrack.advice.input_checks import TRIAL_S, input_checks, messages_within
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import DataError, FgtrackError
@@ -24,19 +23,20 @@ from fgtrack.inputs.formats.native import NATIVE_ADAPTERS
 from fgtrack.inputs.formats.objects import ODOMETRY
 from fgtrack.inputs.formats.tables import headers, rows
 from fgtrack.inputs.geodetic import GEODETIC
-from fgtrack.inputs.guess import (
+from fgtrack.inputs.info import OTHER_CLOCK_S, TopicInfo, describe
+from fgtrack.inputs.ros.bag import Bag
+from fgtrack.inputs.settings import CsvInput, CsvTable, Field, InputConfig, TopicInput
+from fgtrack.inputs.source import input_kind, open_input
+from fgtrack.meaning.assumed import assumed
+from fgtrack.meaning.assumption import Assumed, departures
+from fgtrack.meaning.guess import (
     Guess,
     agreeing_with_motion,
     guesses,
     time_unit,
     words_of,
 )
-from fgtrack.inputs.info import OTHER_CLOCK_S, TopicInfo, describe
-from fgtrack.inputs.ros.bag import Bag
-from fgtrack.inputs.settings import CsvInput, CsvTable, Field, InputConfig, TopicInput
-from fgtrack.inputs.source import input_kind, open_input
-from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.assumptions.assumption import Assumed, departures
+from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
 
 __all__ = ["starting_config"]
 

@@ -1,0 +1,94 @@
+"""Opens recordings, including tables of position reports that need no mapping of their columns."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+from fgtrack.core.checks import check_paths
+from fgtrack.core.errors import CallError
+from fgtrack.inputs.formats.tables import headers, rows
+from fgtrack.inputs.geodetic import GEODETIC
+from fgtrack.inputs.settings import CsvInput, CsvTable, FieldPath, InputConfig
+from fgtrack.inputs.source import InputSource, input_kind, open_input
+from fgtrack.meaning.guess import guesses, time_unit, words_of
+from fgtrack.models.sensors import Filter
+
+__all__ = ["open_recording", "reports"]
+
+#: Number of rows on which the guess of the columns is based.
+_SAMPLES = 200
+_IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
+#: Column of Flightradar24's granular ADS-B data: P for a message with a position, N for a repeated position.
+_HAS_POSITION = {"no_position": Filter(one_of=("P",))}
+
+
+def open_recording(path: Path | str, config: InputConfig | None = None) -> InputSource:
+    """Open the input at `path` as `open_input` does; a table of position reports needs no mapping in `config`.
+
+    Raises as `open_input`. Raises `CallError` if there are several tables of reports.
+    """
+    check_paths(recording=path)
+    config = config or InputConfig()
+    tables = reports(Path(path)) if config.csv == CsvInput() else None
+    return open_input(path, config if tables is None else replace(config, csv=tables))
+
+
+def reports(path: Path) -> CsvInput | None:
+    """Return a guessed mapping of the table of position reports at `path`; None if there is no such table.
+
+    Times, positions in the map (latitude and longitude, or east and north) and
+    identities are read. The sensor is named `adsb` or `ais` after the column of
+    identities, else `reports`. Raises as `open_recording`.
+    """
+    if not path.exists() or input_kind(path) != "csv":
+        return None
+    tables = list[tuple[Path, str, CsvTable]]()
+    is_folder = path.is_dir()
+    for file, names in headers(path).items():
+        cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
+        guessed = guesses(
+            {name: _numbers(each[name] for each in cells) for name in names if name}
+        )
+        known = ("stamp", "receipt", *GEODETIC, "id")
+        columns: dict[str, FieldPath] = {
+            key: guessed[key].path for key in known if key in guessed
+        }
+        if not {*GEODETIC} <= columns.keys():
+            columns |= {
+                key: guessed[key].path for key in ("x_m", "y_m") if key in guessed
+            }
+            if not all(
+                set(words_of(str(columns.get(key, "")))) & _IN_MAP
+                for key in ("x_m", "y_m")
+            ):
+                continue
+        if "stamp" not in columns:
+            continue
+        unit, _ = time_unit(
+            str(columns["stamp"]),
+            _numbers(each[str(columns["stamp"])] for each in cells),
+        )
+        words = set(words_of(str(columns.get("id", ""))))
+        sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
+        filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
+        name = file.name if is_folder else None
+        table = CsvTable(columns, name, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT
+        tables.append((file, sensor, table))
+    if len(tables) > 1:
+        raise CallError(
+            f"{path}: contains {len(tables)} tables of reports: give one of them, for example {tables[0][0]}, "
+            "or set input.csv"
+        )
+    if not tables:
+        return None
+    return CsvInput(detections={sensor: table for _, sensor, table in tables})
+
+
+def _numbers(texts: Iterable[str]) -> list[float]:
+    numbers = []
+    for text in texts:
+        with suppress(ValueError):
+            numbers.append(float(text))
+    return numbers

@@ -1,1 +1,0 @@
-"""Assumptions about a recording without a configuration, estimated from its own lists."""
