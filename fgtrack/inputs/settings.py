@@ -53,8 +53,13 @@ class TopicInput:
 
     topic: str
     """Name of the topic."""
-    frame: Frame | None = None
-    """Frame of the positions; by default `map` if the header names a fixed frame, else `ego`."""
+    frame: Frame | Literal["optical"] | None = None
+    """Frame of the positions; `optical` is a sensor frame with x to the right, y down and z forward.
+
+    Null: the header's `frame_id`. The ego odometry's `frame_id` is the map, its
+    `child_frame_id` the ego; other frames are transformed by tf. Of the frames without
+    a transform, `map`, `world` and `odom` are the map, the others the ego.
+    """
     fields: Mapping[str, FieldPath] | None = None
     """Paths of the fields, for a message type without an adapter.
 

@@ -64,7 +64,7 @@ FORMAT = FileFormat(
         {
             sensor: item.frame
             for sensor, item in config.detections.items()
-            if item.frame
+            if item.frame is not None and item.frame != "optical"
         },
     ),
 )

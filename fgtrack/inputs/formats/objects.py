@@ -81,12 +81,11 @@ def _detection3d(item: RosMessage) -> Detection:
 
 
 def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
-    """Length, width and height of a box with a length, and the height `z_m` of its centre; else empty."""
-    return (
-        {"z_m": z_m, "length_m": size.x, "width_m": size.y, "height_m": size.z}
-        if size.x > 0.0
-        else {}
-    )
+    """Height `z_m` of the centre; length, width and height of a box with a length."""
+    centre = {"z_m": z_m}
+    if size.x > 0.0:
+        centre |= {"length_m": size.x, "width_m": size.y, "height_m": size.z}
+    return centre
 
 
 def autoware_objects(message: RosMessage) -> ObjectList:
@@ -182,7 +181,7 @@ def _radar_track(item: RosMessage) -> Detection:
             values, pose, _planar_triangle(item.velocity_covariance), velocity
         ),
         object_id=_uuid(item.uuid),
-        **_size(item.size),
+        **_size(item.size, position.z),
     )
 
 
@@ -197,11 +196,16 @@ def _planar_triangle(triangle: RosMessage) -> np.ndarray:
 
 def pose_array(message: RosMessage) -> ObjectList:
     """Object list of a `geometry_msgs/PoseArray`: position and yaw."""
-    values = (
-        (each.position.x, each.position.y, yaw_rad(each.orientation))
+    objects = [
+        Detection(
+            each.position.x,
+            each.position.y,
+            yaw_rad(each.orientation),
+            z_m=each.position.z,
+        )
         for each in message.poses
-    )
-    return object_list(message.header, [Detection(*each) for each in values])
+    ]
+    return object_list(message.header, objects)
 
 
 def odometry(message: RosMessage) -> ObjectList:

@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import (
@@ -39,6 +41,7 @@ from fgtrack.inputs.formats.scans import grouped
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
 from fgtrack.inputs.ros.bag import Bag, BagTopic, is_bag
 from fgtrack.inputs.ros.bag_files import settings_of
+from fgtrack.inputs.ros.frames import OPTICAL, BagFrames, Pose, moved_detection
 from fgtrack.inputs.settings import FieldPath, InputConfig, TopicInput
 from fgtrack.inputs.source import FileFormat
 
@@ -67,6 +70,7 @@ FIX_FIELDS: Mapping[str, Mapping[str, FieldPath]] = {
     },
 }
 """Fields of one object with latitude and longitude, by message type; the altitude is kept as z_m."""
+_FORWARD = Pose(OPTICAL, np.zeros(3))
 Convert = Callable[[RosMessage, int], Iterable[Message]]
 """Converts a ROS message and its receipt to messages."""
 TopicUse = tuple[BagTopic, str, Convert]
@@ -84,13 +88,18 @@ def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
     """
     names = {topic.name for topic in bag.topics}
     plane = LocalPlane(config.origin)
+    frames = BagFrames(bag, config.ego.topic if config.ego else None)
     truth = config.truth or ()
     if not isinstance(truth, tuple):
         truth = (truth,)
     roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
         *([("ego", config.ego, partial(_ego, plane=plane))] if config.ego else []),
         *(
-            (f"detections {name}", item, partial(_detections, sensor=name, plane=plane))
+            (
+                f"detections {name}",
+                item,
+                partial(_detections, sensor=name, plane=plane, frames=frames),
+            )
             for name, item in config.detections.items()
         ),
         *(
@@ -233,16 +242,22 @@ def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:
 
 
 def _detections(
-    topic: BagTopic, item: TopicInput, sensor: str, plane: LocalPlane
+    topic: BagTopic,
+    item: TopicInput,
+    sensor: str,
+    plane: LocalPlane,
+    frames: BagFrames | None = None,
 ) -> Convert:
+    """Return the conversion of a topic of detections; without `frames`, positions stay as in the message."""
     if item.fields is None and topic.type in FIX_FIELDS:
         item = replace(item, fields=FIX_FIELDS[topic.type])
     read = _object_list(topic, item, plane)
+    is_geodetic = item.fields is not None and GEODETIC[0] in item.fields
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
         listed = read(message)
+        is_framed = not is_geodetic and hasattr(message, "header")
         stamp_ns = receipt_ns if listed.stamp_ns is None else listed.stamp_ns
-        frame = item.frame or listed.frame or "ego"
         objects, left_out = split(listed.objects)
         if item.filters:
             sources = (
@@ -253,6 +268,14 @@ def _detections(
             objects, left_out = split(
                 _filtered(item, *pair) for pair in zip(objects, sources, strict=True)
             )
+        frame = listed.frame or "ego"
+        if item.frame == "optical":
+            frame = "sensor"
+            objects = tuple(moved_detection(each, _FORWARD) for each in objects)
+        elif item.frame is not None:
+            frame = item.frame
+        elif frames is not None and is_framed and listed.frame != "sensor":
+            frame, objects = frames.placed(objects, message.header.frame_id, stamp_ns)
         return (
             DetectionList(
                 sensor, stamp_ns, receipt_ns, objects, frame, left_out, plane.origin_deg
