@@ -25,6 +25,7 @@ METRICS = Registry(
     {
         "fgtrack.metrics": {
             "ospa": "fgtrack.evaluation.scores.ospa:ospa",
+            "t_gospa": "fgtrack.evaluation.scores.t_gospa:t_gospa",
         }
     },
 )
