@@ -23,9 +23,10 @@ demo: $(RUN)
 
 # Importing compiles what numba has not kept yet; in two halves, else each worker would do all of it.
 test: $(TEST)
-	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.karle2023.euler_kernels, fgtrack.models.feet, \
-	    fgtrack.tracking.kernels, fgtrack.tracking.lives.visibility_kernels' & \
-	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels'; wait
+	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.karle2023.euler_kernels, \
+	    fgtrack.karle2023.storage_kernels, fgtrack.models.feet, fgtrack.tracking.facing_kernels, fgtrack.tracking.kernels, \
+	    fgtrack.tracking.lives.visibility_kernels' & \
+	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.models.measurement_kernels'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests of the core: within a minute of processor time.

@@ -19,6 +19,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from options import Jobs, Out, Scenarios
 from scores import autoferry_sources, nis_ratios, write
 
 import fgtrack
@@ -222,15 +223,13 @@ def main(
     autoferry: Annotated[
         Path, typer.Argument(help="Folder with a folder per scenario.")
     ],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
-        "out/bearings"
-    ),
-    scenarios: Annotated[str, typer.Option(help="Scenarios, all if empty.")] = "",
+    out: Out = Path("out/bearings"),
+    scenarios: Scenarios = "",
     configuration: Annotated[
         str, typer.Option(help="Configuration without cameras.")
     ] = "autoferry",
     seconds: Annotated[float, typer.Option(help="How much of each.")] = 1e6,
-    jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Replay all scenarios without and with cameras, print both tables."""
     config = Config.from_yaml(configuration)

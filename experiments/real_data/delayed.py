@@ -26,6 +26,7 @@ from typing import Annotated, NamedTuple
 import costs
 import typer
 from joblib import Parallel, delayed
+from options import Jobs, Kitti, Out, Sequences
 from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
@@ -110,19 +111,15 @@ def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Fo
 
 
 def main(
-    kitti: Annotated[Path, typer.Option(help="Folder of the KITTI tracking data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
-        "out/delayed"
-    ),
-    sequences: Annotated[
-        str, typer.Option(help="Sequences, separated by commas.")
-    ] = SEQUENCES,
+    kitti: Kitti,
+    out: Out = Path("out/delayed"),
+    sequences: Sequences = SEQUENCES,
     arrangements: Annotated[
         str, typer.Option(help="Arrangements, separated by commas.")
     ] = ",".join(LATE),
     delay_s: Annotated[float, typer.Option(help="Delay of the late sensor.")] = 0.15,
     config_name: Annotated[str, typer.Option("-c", help="Configuration.")] = "kitti",
-    jobs: Annotated[int, typer.Option(help="Sequences at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Replay all sequences with and without the delay, print costs.csv and scores.csv."""
     config = replace(Config.from_yaml(config_name), clock=ClockConfig(node_hz=NODE_HZ))

@@ -17,6 +17,7 @@ from typing import Annotated
 import costs
 import typer
 from joblib import Parallel, delayed
+from options import Estimators, Jobs, Out
 from rules import numbers, recorded, ruled
 from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
@@ -74,19 +75,15 @@ def main(
     autoferry: Annotated[
         Path, typer.Argument(help="Folder with a folder per scenario.")
     ],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
-        "out/held_out"
-    ),
-    estimators: Annotated[
-        str, typer.Option(help="Estimators, separated by commas.")
-    ] = "ekf-replay",
+    out: Out = Path("out/held_out"),
+    estimators: Estimators = "ekf-replay",
     judge: Annotated[str, typer.Option(help="Scenarios to judge, all if empty.")] = "",
     base: Annotated[
         str, typer.Option(help="Configuration that the numbers go into.")
     ] = "autoferry",
     late: Annotated[str, typer.Option(help="Sensor that is late.")] = "lidar",
     delays_s: Annotated[str, typer.Option(help="How late, separated by commas.")] = "",
-    jobs: Annotated[int, typer.Option(help="Scenarios at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Apply the rules with each scenario left out, judge it, print all tables."""
     config = Config.from_yaml(base)

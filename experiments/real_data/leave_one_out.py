@@ -18,6 +18,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from options import Jobs, Kitti, Out, Sequences
 from scipy.optimize import minimize
 from scipy.special import expit
 from scores import SEQUENCES, kitti_sources, raw, raw_mota, scans, write
@@ -161,18 +162,14 @@ def _from(config: Config, lowest: float) -> Config:
 
 
 def main(
-    kitti: Annotated[Path, typer.Option(help="Folder of the KITTI tracking data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
-        "out/leave_one_out"
-    ),
-    sequences: Annotated[
-        str, typer.Option(help="Sequences, separated by commas.")
-    ] = SEQUENCES,
+    kitti: Kitti,
+    out: Out = Path("out/leave_one_out"),
+    sequences: Sequences = SEQUENCES,
     estimator: Annotated[str, typer.Option(help="Estimator.")] = "smoother",
     published: Annotated[
         str, typer.Option(help="From which probabilities, separated by commas.")
     ] = "0.5",
-    jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Fit to all but one, track that one; print leave_one_out.csv."""
     config = replace(Config.from_yaml("kitti"), estimator=estimator)

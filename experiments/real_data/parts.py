@@ -10,11 +10,12 @@ import csv
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from options import Jobs, OptionalAutoferry, OptionalKitti, Out, Scenarios, Sequences
 from scores import SEQUENCES, autoferry_sources, kitti_sources
 
 import fgtrack
@@ -135,22 +136,12 @@ def row(one: Sequence[Judged], shipped: Sequence[Judged]) -> Iterator[str]:
 
 
 def main(
-    autoferry: Annotated[
-        Path | None, typer.Option(help="Folder with a folder per scenario.")
-    ] = None,
-    kitti: Annotated[
-        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
-        "out/parts"
-    ),
-    scenarios: Annotated[
-        str, typer.Option(help="Of Autoferry, separated by commas, all if empty.")
-    ] = "",
-    sequences: Annotated[
-        str, typer.Option(help="Of KITTI, separated by commas.")
-    ] = SEQUENCES,
-    jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
+    autoferry: OptionalAutoferry = None,
+    kitti: OptionalKitti = None,
+    out: Out = Path("out/parts"),
+    scenarios: Scenarios = "",
+    sequences: Sequences = SEQUENCES,
+    jobs: Jobs = 1,
 ) -> None:
     """Switch off one part after the other, write and print parts.csv."""
     sources = {

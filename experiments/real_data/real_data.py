@@ -12,6 +12,15 @@ from typing import Annotated
 
 import typer
 from joblib import Parallel, delayed
+from options import (
+    Estimators,
+    Jobs,
+    OptionalAutoferry,
+    OptionalKitti,
+    Out,
+    Scenarios,
+    Sequences,
+)
 from scores import (
     SEQUENCES,
     Found,
@@ -34,29 +43,19 @@ def judged(name: str, source: Path, config: Config) -> Found:
 
 
 def main(
-    autoferry: Annotated[
-        Path | None, typer.Option(help="Folder with a folder per scenario.")
-    ] = None,
-    kitti: Annotated[
-        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
-        "out/real_data"
-    ),
-    estimators: Annotated[
-        str, typer.Option(help="Estimators, separated by commas.")
-    ] = "ekf-replay,smoother",
-    sequences: Annotated[str, typer.Option(help="Sequences of KITTI.")] = SEQUENCES,
-    scenarios: Annotated[
-        str, typer.Option(help="Scenarios of Autoferry, all if empty.")
-    ] = "",
+    autoferry: OptionalAutoferry = None,
+    kitti: OptionalKitti = None,
+    out: Out = Path("out/real_data"),
+    estimators: Estimators = "ekf-replay,smoother",
+    sequences: Sequences = SEQUENCES,
+    scenarios: Scenarios = "",
     autoferry_config: Annotated[
         str, typer.Option(help="Configuration for Autoferry.")
     ] = "autoferry",
     kitti_config: Annotated[
         str, typer.Option(help="Configuration for KITTI.")
     ] = "kitti",
-    jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Replay all recordings, print their scores and NIS."""
     groups: list[tuple[str, str, dict[str, Path]]] = []

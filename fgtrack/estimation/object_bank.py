@@ -296,8 +296,6 @@ class SingleObject(Stateful):
             return UpdateResult(UpdateStatus.TOO_OLD)
         if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
-        if self._kept is not None and self._kept.has_fused(0, measurement):
-            return UpdateResult(UpdateStatus.DUPLICATE)
         self.advance(stamp_ns)
         with _own_cause():
             result = self.bank.update(
@@ -306,6 +304,12 @@ class SingleObject(Stateful):
         if result.status is not UpdateStatus.FAILED:
             self._newest_ns = max(self._newest_ns, stamp_ns)
         return result
+
+    def has_fused(self, measurement: Measurement) -> bool:
+        """True if the window has an identical measurement, and the bank keeps measurements."""
+        if self._kept is None or measurement.stamp_ns < self.window_ns[0]:
+            return False
+        return self._kept.has_fused(0, measurement)
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""

@@ -15,8 +15,8 @@ from fgtrack.core.plugins import Alias, Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.track_initiation import initiated
-from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.object_bank import ObjectBank, SingleObject
+from fgtrack.estimation.repeated import FusedOnce, MeasurementKeeper
 from fgtrack.models.motion import MotionModel
 
 OOSM_GROUP = "fgtrack.oosm"
@@ -172,9 +172,7 @@ def estimator(
             f"lag_s: must be a number, finite and not negative, is {lag_s!r}"
         )
     one = start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
-    if isinstance(one, WindowedFilter):
-        one.refuses_repeated = True
-    return one
+    return FusedOnce(one) if isinstance(one, MeasurementKeeper) else one
 
 
 def start_estimator(

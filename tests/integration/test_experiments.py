@@ -183,7 +183,7 @@ def test_a_vessel_ends_with_the_misses_of_one_sensor_unless_visibility_is_estima
 def test_a_late_camera_costs_most_where_prompt_positions_are_forgotten(
     tmp_path: Path,
 ) -> None:
-    late = load("late_sensors")
+    late = load("real_data", "late_sensors")
     late.main(
         kitti=shared("data/kitti"),
         out=tmp_path,

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.object_bank import SingleObject
 from fgtrack.estimation.registry import estimator
+from fgtrack.estimation.repeated import FusedOnce
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.models.motion import CV
 from fgtrack.show.figures import plot
@@ -180,7 +180,7 @@ def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(
 def test_a_late_measurement_stands_out_in_the_window_that_it_splits() -> None:
     """One motion factor is split; a state, two motion factors and a measurement factor are new."""
     one = estimator("smoother-banded", CV(), Start(), lag_s=1.0)
-    assert isinstance(one, SingleObject)
+    assert isinstance(one, FusedOnce)
 
     def fuse(*times_ms: int) -> None:
         for ms in times_ms:

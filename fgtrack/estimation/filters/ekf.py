@@ -8,9 +8,7 @@ import numpy as np
 
 from fgtrack.core.linalg import (
     congruence,
-    identity,
     kernels,
-    psd_solve,
     stacked,
     symmetrise,
 )
@@ -28,21 +26,6 @@ _KALMAN = "fgtrack.estimation.kernels.kalman"
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
     """Covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
     return symmetrise(congruence(F, P) + Q)
-
-
-def kalman_gain(
-    P: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Gain K = P H' S^-1 (..., n, k), and innovation covariance S = H P H' + R (..., k, k), which must be regular."""
-    HP = H @ P
-    S = HP @ H.mT + R
-    return psd_solve(S, HP).mT, S
-
-
-def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Covariance (I - K H) P (I - K H)' + K R K' after a measurement H x + N(0, R) with any gain K, (..., n, n)."""
-    A = identity(P.shape[-1]) - K @ H
-    return symmetrise(congruence(A, P) + congruence(K, R))
 
 
 def robust_weight(

@@ -92,8 +92,11 @@ class ReplayEkf(WindowedFilter):
             : max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)
         ]
 
-    def _has_fused(self, measurement: Measurement) -> bool:
+    def has_fused(self, measurement: Measurement) -> bool:
+        """True if the window has an identical measurement."""
         stamp_ns = measurement.stamp_ns
+        if stamp_ns < self._start_ns:
+            return False
         first = bisect.bisect_left(self.steps, stamp_ns, key=_stamp)
         last = bisect.bisect_right(self.steps, stamp_ns, key=_stamp)
         fused = [step.measurement for step in self.steps[first:last]]

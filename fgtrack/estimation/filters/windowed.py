@@ -31,9 +31,6 @@ class WindowedFilter(Stateful, ABC):
         "_newest_ns",
     )
 
-    refuses_repeated = False
-    """True if an identical measurement is a duplicate. A bank fuses it: two sensors may measure the same values."""
-
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
         self._lag_ns = nanoseconds(lag_s)
@@ -53,8 +50,6 @@ class WindowedFilter(Stateful, ABC):
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
-        if self.refuses_repeated and self._has_fused(measurement):
-            return UpdateResult(UpdateStatus.DUPLICATE)
         try:
             result = self._fuse(measurement.seen_by(self._motion))
         except np.linalg.LinAlgError:
@@ -72,10 +67,6 @@ class WindowedFilter(Stateful, ABC):
         self._newest_ns = stamp_ns
         self.advance(stamp_ns)
         return UpdateStatus.IN_SEQUENCE
-
-    def _has_fused(self, measurement: Measurement) -> bool:
-        """True if the filter keeps its measurements, and has an identical one."""
-        return False
 
     def __repr__(self) -> str:
         return described(type(self).__name__, self._motion, self.window_ns)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
+from fgtrack.estimation.filters.ekf import correct, propagated
 from fgtrack.noise.likelihood.contaminated import update
 from fgtrack.noise.likelihood.reference import FilterStep, filtered
 from fgtrack.noise.likelihood.series import NoiseSpace, Series
@@ -147,9 +147,7 @@ class Innovations:
             Ss[k] = item.S
             if self._has_assumed[k]:
                 y, H, R_assumed = (array[k] for array in self._assumed)
-                K, _ = kalman_gain(P, np.broadcast_to(H, (b, *H.shape)), R_assumed)
-                x = x + (K @ (y - (H @ x[..., None])[..., 0])[..., None])[..., 0]
-                P = joseph(P, K, H, R_assumed)
+                x, P = _corrected(x, P, y - (H @ x[..., None])[..., 0], H, R_assumed)
             x = x + (self._predicted[k] - self._after[k])
         log_likelihoods += 0.5 * math.log(math.tau) * self._padding[:, None]
         return Evaluation(
@@ -180,3 +178,21 @@ class Innovations:
         Q = np.array([model.process_noise(x, dt_s) for model in models])
         moved = moved + (F @ self._offset[block][..., None])[..., 0]
         return F, np.where(there[..., None], moved - self._predicted[block], 0.0), Q
+
+
+def _corrected(
+    x: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return means (b, t, n) and covariances (b, t, n, n) after innovations y (b, t, a).
+
+    H (t, a, n) and R (t, a, a) are the same for all b parameter vectors.
+    """
+    b, (a, n) = len(x), H.shape[-2:]
+    result = correct(
+        x.reshape(-1, n),
+        P.reshape(-1, n, n),
+        y.reshape(-1, a),
+        np.tile(H, (b, 1, 1)),
+        np.tile(R, (b, 1, 1)),
+    )
+    return result.mean.reshape(x.shape), result.covariance.reshape(P.shape)

@@ -1,6 +1,6 @@
 """What does each estimator lose where one sensor of a real recording is late?
 
-    python experiments/late_sensors/late_sensors.py --kitti KITTI --autoferry AUTOFERRY -o out/late_sensors --jobs 2
+    python experiments/real_data/late_sensors.py --kitti KITTI --autoferry AUTOFERRY -o out/late_sensors --jobs 2
 
 KITTI is the folder of the tracking data set, AUTOFERRY holds a folder for each scenario. One sensor at a time gets a
 constant delay behind its stamps, the others stay as recorded. The configurations are the shipped ones; where a camera
@@ -20,6 +20,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from options import Jobs, OptionalAutoferry, OptionalKitti, Out
 
 import fgtrack
 from fgtrack import Config, FloatArray, open_input
@@ -110,15 +111,9 @@ def rows(recordings: Sequence[Sequence[FloatArray]]) -> Iterator[list[str]]:
 
 
 def main(
-    kitti: Annotated[
-        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
-    ] = None,
-    autoferry: Annotated[
-        Path | None, typer.Option(help="Folder with a folder per scenario.")
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
-        "out/late_sensors"
-    ),
+    kitti: OptionalKitti = None,
+    autoferry: OptionalAutoferry = None,
+    out: Out = Path("out/late_sensors"),
     late: Annotated[
         str, typer.Option(help="Sensors to delay, separated by commas, all if empty.")
     ] = "",
@@ -128,7 +123,7 @@ def main(
     delays_s: Annotated[
         str, typer.Option(help="Delays, separated by commas.")
     ] = "0.15,0.3,1",
-    jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Delay one sensor after the other, write late_sensors.csv."""
     sources: Mapping[str, list[Path]] = {
