@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.geometry import may_be_radians
 from fgtrack.core.types import BoolArray, FloatArray
 
-__all__ = ["EGO", "Diagnostic", "in_degrees", "late_ego", "too_late"]
+__all__ = ["EGO", "Diagnostic", "in_degrees", "late_ego", "reasons", "too_late"]
 
 EGO = "ego"
 """`Diagnostic.about` of a problem of the ego."""
@@ -31,6 +31,14 @@ class Diagnostic:
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}"
+
+
+def reasons(counts: Mapping[str, int]) -> str:
+    """Text of `counts` by setting or reason, the largest first: `40 by filters.score, 2 by max_range_m`."""
+    return ", ".join(
+        f"{count} by {name}"
+        for name, count in sorted(counts.items(), key=lambda item: -item[1])
+    )
 
 
 def in_degrees(about: str, name: str, least: float, most: float) -> Diagnostic | None:

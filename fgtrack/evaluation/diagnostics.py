@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees, late_ego, too_late
+from fgtrack.core.diagnostic import (
+    EGO,
+    Diagnostic,
+    in_degrees,
+    late_ego,
+    reasons,
+    too_late,
+)
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
@@ -161,14 +168,6 @@ def unused(run: Run) -> str | None:
         return None
     names = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
     return f"none of the {counts.total()} detections was used ({names})"
-
-
-def reasons(counts: Mapping[str, int]) -> str:
-    """Text of `counts` by setting, the largest first: `40 by filters.score, 2 by max_range_m`."""
-    return ", ".join(
-        f"{count} by {name}"
-        for name, count in sorted(counts.items(), key=lambda item: -item[1])
-    )
 
 
 def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:

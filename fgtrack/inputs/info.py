@@ -1,18 +1,19 @@
 """Contents of an input: topics or sensors with counts, rates and delays."""
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 
 import numpy as np
 
-from fgtrack.core.diagnostic import late_ego
+from fgtrack.core.diagnostic import late_ego, reasons
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds, wrong_unit
 from fgtrack.core.types import DetectionList, EgoState, Message
 from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.receipts import WRONG_RECEIPT, sorted_out
 from fgtrack.inputs.ros.bag import Bag, BagTopic
 from fgtrack.inputs.ros.topics import topic_uses
 from fgtrack.inputs.settings import InputConfig
@@ -76,6 +77,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     used: dict[BagTopic, str] = {}
     times: dict[BagTopic, list[_Times]] = defaultdict(list)
     object_is_late: dict[BagTopic, list[bool]] = defaultdict(list)
+    left_out: dict[str, Counter[str]] = defaultdict(Counter)
     in_map = set[str]()
     problem: str | None = None
     if kind == "recording":
@@ -85,10 +87,10 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
             used = {topic: role for topic, role, _ in topic_uses(bag, given)}
         except DataError as error:
             problem = str(error) if config else None
-        readable = UntilBreak(bag.stamps())
+        readable = UntilBreak(_right(bag.stamps(), left_out))
     else:
         messages = open_input(path, given).messages()
-        readable = UntilBreak(_stamps(messages, object_is_late, in_map))
+        readable = UntilBreak(_stamps(messages, object_is_late, in_map, left_out))
     for topic, receipt_ns, stamp_ns in readable:
         times[topic].append((receipt_ns, stamp_ns))
     if readable.error is not None:
@@ -98,12 +100,17 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
             topic: topic.type.replace("detections", f"detections {topic.name}")
             for topic in times
         }
-    topics = _with_late_ego(
-        [
-            _topic(topic, times[topic], used.get(topic), object_is_late.get(topic, ()))
-            for topic in sorted(times, key=attrgetter("name"))
-        ],
-        in_map,
+    topics = _with_left_out(
+        _with_late_ego(
+            [
+                _topic(
+                    topic, times[topic], used.get(topic), object_is_late.get(topic, ())
+                )
+                for topic in sorted(times, key=attrgetter("name"))
+            ],
+            in_map,
+        ),
+        left_out,
     )
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
@@ -196,15 +203,43 @@ def _with_late_ego(
     return tuple(noted)
 
 
+def _with_left_out(
+    topics: Sequence[TopicInfo], left_out: Mapping[str, Counter[str]]
+) -> tuple[TopicInfo, ...]:
+    """Return `topics` with a note on what the reader leaves out, by the name of the topic."""
+    noted = []
+    for topic in topics:
+        if counts := left_out.get(topic.name):
+            text = f"{counts.total()} left out by the reader ({reasons(counts)})"
+            note = text if topic.note is None else f"{topic.note}; {text}"
+            topic = replace(topic, note=note)
+        noted.append(topic)
+    return tuple(noted)
+
+
+def _right(
+    stamps: Iterable[tuple[BagTopic, int, int | None]],
+    left_out: Mapping[str, Counter[str]],
+) -> Iterator[tuple[BagTopic, int, int | None]]:
+    """Yield the `stamps` of a recording's messages without wrong log times, which are counted in `left_out`."""
+    for each, is_wrong in sorted_out(stamps, itemgetter(1)):
+        if is_wrong:
+            left_out[each[0].name][WRONG_RECEIPT] += 1
+        else:
+            yield each
+
+
 def _stamps(
     messages: Iterator[Message],
     object_is_late: Mapping[BagTopic, list[bool]],
     in_map: set[str],
+    left_out: Mapping[str, Counter[str]],
 ) -> Iterator[tuple[BagTopic, int, int | None]]:
     """Yield topic, receipt and stamp of each message, as if the input were a recording with a topic for each sensor.
 
     Appends the lateness of detections with an identity (`IdentityOrder.late`) to
-    `object_is_late`, and adds the sensors with detections in the map to `in_map`.
+    `object_is_late`, adds the sensors with detections in the map to `in_map`, and the
+    counts of what the reader leaves out to `left_out`.
     """
     order = IdentityOrder()
     for message in messages:
@@ -217,6 +252,7 @@ def _stamps(
         topic = BagTopic(name, kind, None)
         if isinstance(message, DetectionList):
             object_is_late[topic] += order.late(message)
+            left_out[message.sensor].update(message.left_out)
             if message.frame == "map":
                 in_map.add(message.sensor)
         yield topic, message.receipt_ns, message.stamp_ns

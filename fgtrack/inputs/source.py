@@ -9,6 +9,7 @@ from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Message
 from fgtrack.inputs.formats import ADAPTERS
+from fgtrack.inputs.receipts import with_right_receipts
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.validation import validated
 
@@ -65,7 +66,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     return InputSource(
         path,
         name,
-        partial(validated, path, messages, form.validates),
+        lambda: with_right_receipts(path, validated(path, messages, form.validates)),
         partial(form.settings, path),
     )
 
