@@ -154,7 +154,9 @@ def with_right_receipts(path: Path, messages: Iterable[Message]) -> Iterator[Mes
         else:
             yield message
     if wrong:
-        counts = ", ".join(f"{count} of {name}" for name, count in sorted(wrong.items()))
+        counts = ", ".join(
+            f"{count} of {name}" for name, count in sorted(wrong.items())
+        )
         warn_once(
             f"{path}: left out messages with receipts that do not fit the others: {counts}"
         )

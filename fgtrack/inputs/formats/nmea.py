@@ -1,19 +1,23 @@
-"""NMEA 0183 logs of an AIS receiver: positions of ships, read with pyais (extra `ais`).
+"""NMEA 0183 logs of AIS receivers: positions of ships, read with pyais (extra `ais`).
 
 A report has the UTC second of its position (ITU-R M.1371-5, table 48), but no minute
-and no date. The log's clock comes from its tag blocks (`c:`), else from the receiver's
-own GNSS ($--RMC, ZDA, GLL, GGA). Lines before the first time get the first time.
+and no date. These come from the time of the report's own line: a tag block (`c:`), a
+preceding `$PGHP`, or a number or an ISO date behind or before the sentence. Other
+reports get the time of the receiver's own GNSS ($--RMC, ZDA, GLL, GGA), and before the
+first time the first one.
 
-The receipt is the end of the current second of this clock. The stamp is the latest time
-up to the receipt with the report's second. If the report's second is ahead by up to 3
-s, the clock is late, and the receipt is set to the stamp. A report without a second has
-the receipt as its stamp. Reports without a position, and damaged reports, are not read.
+The receipt is the end of the second of the newest time up to the line. The stamp is the
+latest time up to the report's own reception with the report's second. If the report's
+second is ahead by up to 3 s, the clock is late, and the receipt is set to the stamp. A
+report without a second has its reception as the stamp.
+
+Reports with a wrong checksum, a time that does not fit the neighbouring lines, a
+damaged payload or no position are left out and counted.
 """
 
 import math
 import re
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterable, Iterator
 from heapq import merge
 from operator import attrgetter
 from pathlib import Path
@@ -25,18 +29,29 @@ from fgtrack.core.files import open_file
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.inputs.formats.nmea_times import (
+    LogTimes,
+    is_damaged,
+    log_times,
+    split_line,
+)
 from fgtrack.inputs.geodetic import LocalPlane
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.source import FileFormat
 
 _ENDINGS = (".nmea", ".log", ".txt", ".ais")
-_IS_AIS = re.compile(rb"^(\\[^\\]*\\)?!(AI|AB|BS)VD[MO],", re.MULTILINE)
-_TAG_TIME = re.compile(rb"^\\(?:[^\\]*,)?c:(\d+)")
-_OWN_TIME = re.compile(rb"\$..(RMC|ZDA|GLL|GGA),(.*)")
+_REPORT = rb"(\\[^\\\n]*\\){0,3}![A-Z]{2}VD[MO],\d,\d,"
+_IS_LOG = re.compile(rb"^[^\n\\!${]{0,60}" + _REPORT, re.MULTILINE)
+#: A row of a table has several cells before a sentence.
+_IS_LOG_AS_TABLE = re.compile(rb"^[^\n,;\\!${]{0,40}[,;]?\"?" + _REPORT, re.MULTILINE)
+#: Before reports, the log of a ship may have many sentences of other instruments.
+_HEAD_BYTES = 1 << 18
+_IS_REPORT = re.compile(rb"![A-Z]{2}VD[MO],")
+#: Number, and identity of the message, of a sentence of a message with several.
+_PART = re.compile(rb"(?:![A-Z]{5}),[2-9],(\d),(\d?,[^,]?),")
 _KNOT_MPS = 1852.0 / 3600.0
 #: Message types with positions of ships, and of aircraft in search and rescue.
 _POSITIONS = frozenset({1, 2, 3, 9, 18, 19, 27})
-_DAY_S = 86_400
 _MINUTE_S = 60
 #: Largest lead of a report's second before the log's clock.
 _AHEAD_S = 3
@@ -44,50 +59,11 @@ _AHEAD_S = 3
 _NO_SPEED_KN = 102.3
 _NO_COURSE_DEG = 360.0
 _MOVING_MPS = 0.5
-
-
-class _Clock:
-    """Clock of a log, advanced line by line: UTC seconds since 1970, or of the day if the log has no date."""
-
-    def __init__(self, midnight_s: float = 0.0) -> None:
-        self.now_s: float | None = None
-        self._midnight_s = midnight_s
-
-    def read(self, line: bytes) -> None:
-        """Advance the clock to the time in `line`, if the line has one; the clock never goes back."""
-        if tag := _TAG_TIME.match(line):
-            number = float(tag[1])
-            self._advance(number / 1000.0 if number > 1e11 else number)
-        elif (own := _OWN_TIME.match(line)) and not _TAG_TIME.match(line):
-            fields = own[2].decode("ascii", "replace").split("*")[0].split(",")
-            try:
-                self._read_own(own[1].decode(), fields)
-            except (
-                ValueError,
-                IndexError,
-            ):  # a receiver without a fix sends empty fields
-                return
-
-    def _read_own(self, kind: str, fields: list[str]) -> None:
-        text = fields[4 if kind == "GLL" else 0]
-        if kind == "RMC":
-            self._midnight_s = (
-                datetime.strptime(fields[8], "%d%m%y").replace(tzinfo=UTC).timestamp()
-            )
-        elif kind == "ZDA":
-            self._midnight_s = (
-                datetime.strptime("-".join(fields[1:4]), "%d-%m-%Y")
-                .replace(tzinfo=UTC)
-                .timestamp()
-            )
-        time_s = 3600.0 * int(text[:2]) + 60.0 * int(text[2:4]) + float(text[4:])
-        # These sentences have no date: choose the day nearest to the clock.
-        if kind in ("GLL", "GGA") and self.now_s is not None:
-            time_s += _DAY_S * round((self.now_s - self._midnight_s - time_s) / _DAY_S)
-        self._advance(self._midnight_s + time_s)
-
-    def _advance(self, time_s: float) -> None:
-        self.now_s = time_s if self.now_s is None else max(self.now_s, time_s)
+#: Reasons for which a report is left out.
+_CHECKSUM = "wrong checksum"
+_TIME = "wrong time"
+_DAMAGED = "damaged payload"
+_NO_POSITION = "missing position"
 
 
 def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
@@ -95,46 +71,86 @@ def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
     from pyais import IterMessages
     from pyais.exceptions import AISBaseException
 
-    first = _Clock()
     with open_file(file) as lines:
-        for line in lines:
-            first.read(line)
-            if first.now_s is not None and first.now_s >= _DAY_S:
-                break
-    if first.now_s is None:
+        times = log_times(lines)
+    if times is None:
         raise DataError(
-            f"{file}: has no time: a log needs tag blocks (c:), or sentences $--RMC, ZDA, GLL or GGA"
+            f"{file}: has no time: a log needs tag blocks (c:), sentences $--RMC, ZDA, GLL, GGA or $PGHP, "
+            "or a time before or behind each report"
         )
     receipt_ns = -LARGEST_NS
-    clock = _Clock(first.now_s - first.now_s % _DAY_S)
+    left_out: list[str] = []
     with open_file(file) as lines:
-
-        def read() -> Iterator[bytes]:
-            for line in lines:
-                clock.read(line.strip())
-                yield line.strip()
-
-        for sentence in IterMessages(read()):
+        sentences = _Sentences(lines, times, left_out)
+        for sentence in IterMessages(sentences):
             try:
                 item = _detection(report := sentence.decode(), plane)
             except (AISBaseException, ValueError, IndexError, KeyError):
-                continue  # the radio link damaged the report
-            if item is not None:
-                receipt_s = (first.now_s if clock.now_s is None else clock.now_s) + 1.0
-                second = getattr(report, "second", _MINUTE_S)
-                age_s = 0.0
-                if second < _MINUTE_S:
-                    age_s = (receipt_s - second + _AHEAD_S) % _MINUTE_S - _AHEAD_S
-                stamp_ns = round((receipt_s - age_s) * NS_PER_S)
-                receipt_ns = max(receipt_ns, stamp_ns, round(receipt_s * NS_PER_S))
-                yield DetectionList(
-                    "ais",
-                    stamp_ns,
-                    receipt_ns,
-                    (item,),
-                    "map",
-                    origin_deg=plane.origin_deg,
-                )
+                left_out.append(_DAMAGED)
+                continue
+            if item is None:
+                left_out += [_NO_POSITION] * (report.msg_type in _POSITIONS)
+                continue
+            stamp_s = end_s = math.floor(sentences.received_s) + 1.0
+            second = getattr(report, "second", _MINUTE_S)
+            if second < _MINUTE_S:
+                stamp_s -= (end_s - second + _AHEAD_S) % _MINUTE_S - _AHEAD_S
+            stamp_ns = round(stamp_s * NS_PER_S)
+            arrived_s = max(end_s, math.floor(sentences.arrived_s) + 1.0)
+            receipt_ns = max(receipt_ns, stamp_ns, round(arrived_s * NS_PER_S))
+            yield _list(stamp_ns, receipt_ns, (item,), tuple(left_out), plane)
+            left_out.clear()
+    if left_out:
+        end_ns = max(receipt_ns, round(float(times.arrived_s[-1]) * NS_PER_S))
+        yield _list(end_ns, end_ns, (), tuple(left_out), plane)
+
+
+class _Sentences:
+    """Iterator over the sound sentences of a log; the reasons for damaged reports are added to `left_out`."""
+
+    def __init__(
+        self, lines: Iterable[bytes], times: LogTimes, left_out: list[str]
+    ) -> None:
+        self._lines = lines
+        self._times = times
+        self._left_out = left_out
+        #: Reception of the first part of each message of several sentences.
+        self._begun_s: dict[bytes, float] = {}
+        self.received_s = 0.0
+        """Reception of the present sentence's report."""
+        self.arrived_s = 0.0
+        """Lower bound of the report's receipt."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        for number, line in enumerate(self._lines):
+            sentence = split_line(line).sentence
+            if not _IS_REPORT.match(sentence):
+                continue
+            if is_damaged(sentence):
+                self._left_out.append(_CHECKSUM)
+                continue
+            if self._times.is_wrong[number]:
+                self._left_out.append(_TIME)
+                continue
+            self.received_s = float(self._times.received_s[number])
+            self.arrived_s = float(self._times.arrived_s[number])
+            if part := _PART.match(sentence):
+                if part[1] == b"1":
+                    self._begun_s[part[2]] = self.received_s
+                self.received_s = self._begun_s.get(part[2], self.received_s)
+            yield sentence
+
+
+def _list(
+    stamp_ns: int,
+    receipt_ns: int,
+    objects: tuple[Detection, ...],
+    left_out: tuple[str, ...],
+    plane: LocalPlane,
+) -> DetectionList:
+    return DetectionList(
+        "ais", stamp_ns, receipt_ns, objects, "map", left_out, plane.origin_deg
+    )
 
 
 def _detection(
@@ -171,7 +187,9 @@ def _files(path: Path) -> list[Path]:
 
 def _is_log(file: Path) -> bool:
     with open_file(file) as log:
-        return _IS_AIS.search(log.read(4096)) is not None
+        head = log.read(_HEAD_BYTES)
+    form = _IS_LOG_AS_TABLE if file.suffix in (".csv", ".tsv") else _IS_LOG
+    return b"\0" not in head and form.search(head) is not None
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
