@@ -37,6 +37,8 @@ class Field:
     """Added after scaling, in the same unit. `scale: -1, offset: 90` converts a compass heading in degrees to a yaw."""
     degrees: bool = False
     """True if the result is in degrees and is to be converted to radians."""
+    unknown: tuple[float, ...] = ()
+    """Recorded numbers that mean "unknown", for example `[102.3]` for a speed in AIS tables; the value is missing."""
 
     def value(self, raw: float) -> float:
         """Return the converted number."""
@@ -67,9 +69,11 @@ class TopicInput:
     (default `header.stamp`). All other entries are paths in one object: `object_stamp`,
     `object_id`, the measured components (or `latitude_deg` and `longitude_deg`), and
     descriptions (`score`, `class_name`, sizes). Several paths for one component are a
-    vector, whose length is read: `speed_mps: [velocity.x, velocity.y]`. A quaternion
-    gives its yaw. A mapping converts a number: `{path: angle, scale: -1, offset: 0,
-    degrees: true}`.
+    vector, whose length is read: `speed_mps: [velocity.x, velocity.y]`. Two paths for
+    `range_rate_mps` are a velocity relative to the ego, along the axes of the
+    positions; its component along the line of sight is read. A quaternion gives its
+    yaw. A mapping converts a number: `{path: angle, scale: -1, offset: 0, degrees:
+    true}`.
     """
     filters: Mapping[str, Filter] = field(default_factory=dict)
     """Conditions for the objects that are read, by field of a detection (`score`, `class_name`, `speed_mps` ...).
@@ -96,7 +100,11 @@ class CsvTable:
     """A CSV file, or some rows of a file that contains several sensors or kinds."""
 
     columns: Mapping[str, FieldPath]
-    """Columns of `stamp`, `receipt` (by default the stamp), `object_id` and each component, as in `fields`."""
+    """Columns of `stamp`, `receipt` (by default the stamp), `object_id` and each component, as in `fields`.
+
+    Two columns of a time are whole seconds and nanoseconds, which are added: `stamp:
+    [header.stamp.sec, header.stamp.nanosec]`.
+    """
     file: str | None = None
     """Name of the file next to the input or inside it; by default the input itself."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"

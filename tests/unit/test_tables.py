@@ -388,3 +388,58 @@ def test_one_wrong_clock_among_many_does_not_make_a_table_years_long(tmp_path):
         f"time,lat,lon\n1970-01-01 00:00:00,41.3,2.08\n{rows}"
     )
     assert len(list(open_recording(tmp_path).messages())) == 121
+
+
+def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path):
+    write(
+        tmp_path,
+        radar="s,ns,x,y\n1700000000,100000000,30,2\n1700000000,200000001,31,2\n",
+    )
+    table = CsvTable({"stamp": ["s", "ns"], "x_m": "x", "y_m": "y"}, "radar.csv")
+    assert [each.stamp_ns for each in messages(tmp_path, detections={"r": table})] == [
+        1_700_000_000_100_000_000,
+        1_700_000_000_200_000_001,
+    ]
+
+
+def test_three_columns_are_no_time(tmp_path):
+    write(tmp_path, radar="a,b,c,x,y\n1,2,3,30,2\n")
+    table = CsvTable({"stamp": ["a", "b", "c"], "x_m": "x", "y_m": "y"}, "radar.csv")
+    with pytest.raises(DataError, match="one column, or seconds and nanoseconds"):
+        messages(tmp_path, detections={"r": table})
+
+
+def test_a_relative_velocity_gives_its_part_along_the_line_of_sight(tmp_path):
+    write(tmp_path, radar="t,x,y,vx,vy\n1,30,40,-5,10\n2,30,40,,10\n3,0,-20,7,4\n")
+    columns = {"stamp": "t", "x_m": "x", "y_m": "y", "range_rate_mps": ["vx", "vy"]}
+    read = messages(tmp_path, detections={"r": CsvTable(columns, "radar.csv")})
+    rates = [each.objects[0].range_rate_mps for each in read]
+    assert rates[0] == pytest.approx(-5.0 * 0.6 + 10.0 * 0.8)
+    assert rates[1] is None
+    assert rates[2] == pytest.approx(-4.0)
+
+
+def test_a_relative_velocity_may_have_a_unit_and_belong_to_a_bearing(tmp_path):
+    write(tmp_path, radar="t,r,b,vx,vy\n1,50,1.5707963,1,-36\n")
+    rate = Field(["vx", "vy"], scale=1.0 / 3.6)
+    columns = {"stamp": "t", "range_m": "r", "bearing_rad": "b", "range_rate_mps": rate}
+    [read] = messages(tmp_path, detections={"r": CsvTable(columns, "radar.csv")})
+    assert read.objects[0].range_rate_mps == pytest.approx(-10.0, abs=1e-6)
+
+
+def test_a_relative_velocity_is_refused_for_positions_in_the_map(tmp_path):
+    write(tmp_path, radar="t,x,y,vx,vy\n1,30,40,-5,10\n")
+    columns = {"stamp": "t", "x_m": "x", "y_m": "y", "range_rate_mps": ["vx", "vy"]}
+    table = CsvTable(columns, "radar.csv", frame="map")
+    with pytest.raises(CallError, match="positions in the frame ego or sensor"):
+        messages(tmp_path, detections={"r": table})
+
+
+def test_numbers_that_mean_unknown_are_missing_values(tmp_path):
+    write(tmp_path, radar="t,x,y,sog\n1,30,40,10\n2,31,40,102.3\n3,,,102.3\n")
+    speed = Field("sog", scale=0.514444, unknown=(102.3,))
+    columns = {"stamp": "t", "x_m": "x", "y_m": "y", "speed_mps": speed}
+    read = messages(tmp_path, detections={"r": CsvTable(columns, "radar.csv")})
+    assert read[0].objects[0].speed_mps == pytest.approx(5.14444)
+    assert read[1].objects == (Detection(x_m=31.0, y_m=40.0),)
+    assert read[2].objects == ()

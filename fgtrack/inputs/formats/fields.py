@@ -43,6 +43,13 @@ _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {
 }
 
 
+RELATIVE_IN_MAP = (
+    "range_rate_mps: a relative velocity needs positions in the frame ego or sensor, "
+    "not map: remove it from the mapping"
+)
+_RANGE_RATE = "range_rate_mps"
+
+
 class FieldError(Exception):
     """A path leads to no valid value; the reader of the recording adds the position."""
 
@@ -51,9 +58,40 @@ def mapped(
     fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
 ) -> dict[str, Any]:  # Any: arguments of `EgoState`, `Detection` and `TruthState`
     """Return the mapped components among `names`, by name; `read` returns the recorded value at a path, or None."""
-    return {
-        name: _component(name, fields[name], read) for name in names if name in fields
+    values = {
+        name: _component(name, fields[name], read)
+        for name in names
+        if name in fields and not (name == _RANGE_RATE and is_relative_velocity(fields))
     }
+    if _RANGE_RATE in names and is_relative_velocity(fields):
+        values[_RANGE_RATE] = _along_sight(fields[_RANGE_RATE], values, read)
+    return values
+
+
+def is_relative_velocity(fields: Mapping[str, FieldPath]) -> bool:
+    """True if the range rate is computed from the two components of a relative velocity."""
+    return _RANGE_RATE in fields and len(paths_of(fields[_RANGE_RATE])) > 1
+
+
+def _along_sight(
+    path: FieldPath, values: Mapping[str, Any], read: Callable[[str], Any]
+) -> float | None:
+    """Component of a relative velocity along the line of sight; None if the velocity or the direction is missing."""
+    paths = paths_of(path)
+    if len(paths) != 2:
+        raise FieldError(f"{paths}: range_rate_mps needs one path, or two for x and y")
+    velocity = [_float(read(each), each) for each in paths]
+    x_m, y_m = values.get("x_m"), values.get("y_m")
+    bearing_rad = values.get("bearing_rad")
+    if x_m is not None and y_m is not None:
+        bearing_rad = math.atan2(y_m, x_m)
+    if bearing_rad is None or velocity[0] is None or velocity[1] is None:
+        return None
+    converted = path if isinstance(path, Field) else Field(paths)
+    if any(each in converted.unknown for each in velocity):
+        return None
+    along = velocity[0] * math.cos(bearing_rad) + velocity[1] * math.sin(bearing_rad)
+    return converted.value(along)
 
 
 def paths_of(path: FieldPath) -> list[str]:
@@ -82,6 +120,8 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
     numbers = [_float(read(each), each) for each in paths_of(path)]
     present = [value for value in numbers if value is not None]
     if len(present) < len(numbers):
+        return None
+    if isinstance(path, Field) and any(each in path.unknown for each in present):
         return None
     raw = present[0] if len(present) == 1 else math.hypot(*present)
     if not isinstance(path, Field):

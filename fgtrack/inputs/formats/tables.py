@@ -36,10 +36,11 @@ from fgtrack.core.types import (
 from fgtrack.inputs.formats.common import exact_ns
 from fgtrack.inputs.formats.fields import (
     COMPONENTS,
+    RELATIVE_IN_MAP,
     FieldError,
+    is_relative_velocity,
     mapped,
     paths_of,
-    single_path,
 )
 from fgtrack.inputs.formats.fusiontracking import LOG_NAME
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
@@ -242,14 +243,22 @@ def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
     """Return stamp and receipt of a row in integer nanoseconds."""
     times: list[int] = []
     for name in _TIMES:
-        column = single_path(table.columns.get(name, table.columns["stamp"]))
-        try:
-            times.append(_time_ns(cells[column], table.time_unit))
-        except (ArithmeticError, ValueError) as error:
+        columns = paths_of(table.columns.get(name, table.columns["stamp"]))
+        if len(columns) > 2:
             raise FieldError(
-                f"{column}: {cells[column]!r:.40} is not a time in {table.time_unit}: "
-                "correct the cell or `time_unit`"
-            ) from error
+                f"{columns}: a time is one column, or seconds and nanoseconds"
+            )
+        units = [table.time_unit] if len(columns) == 1 else ["s", "ns"]
+        time_ns = 0
+        for column, unit in zip(columns, units, strict=True):
+            try:
+                time_ns += _time_ns(cells[column], unit)
+            except (ArithmeticError, ValueError) as error:
+                raise FieldError(
+                    f"{column}: {cells[column]!r:.40} is not a time in {unit}: "
+                    "correct the cell or `time_unit`"
+                ) from error
+        times.append(time_ns)
     stamp_ns, receipt_ns = times
     return receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns
 
@@ -318,6 +327,10 @@ def _file(path: Path, table: CsvTable, role: str) -> Path:
         raise CallError(
             f"{where}.columns: must name {', '.join(sorted(needed))}{measured}"
         )
+    if is_relative_velocity(table.columns) and (
+        table.frame == "map" or GEODETIC[0] in table.columns
+    ):
+        raise CallError(f"{where}.columns: {RELATIVE_IN_MAP}")
     if table.file is None and path.is_dir():
         raise CallError(f"{path}: is a folder, so {where} must name its file")
     if table.file is None:

@@ -23,8 +23,10 @@ from fgtrack.inputs.formats.common import ObjectList, RosMessage, object_id, spl
 from fgtrack.inputs.formats.fields import (
     EGO_FIELDS,
     OBJECT_FIELDS,
+    RELATIVE_IN_MAP,
     FieldError,
     ego_by_fields,
+    is_relative_velocity,
     items_by_fields,
     objects_by_fields,
     value_at,
@@ -258,6 +260,9 @@ def _detections(
         listed = read(message)
         is_framed = not is_geodetic and hasattr(message, "header")
         stamp_ns = receipt_ns if listed.stamp_ns is None else listed.stamp_ns
+        in_map = is_geodetic or (item.frame or listed.frame) == "map"
+        if in_map and is_relative_velocity(item.fields or {}):
+            raise FieldError(RELATIVE_IN_MAP)
         objects, left_out = split(listed.objects)
         if item.filters:
             sources = (
