@@ -10,9 +10,7 @@ os.environ["PYTHONPATH"] = str(ROOT)
 
 import fgtrack  # noqa: E402
 
-suppress_warnings = [
-    "ref.python"
-]  # annotations with Discriminator("kind") name the field of several classes
+suppress_warnings = ["ref.python"]  # annotations with Discriminator("kind") name the field of several classes
 project = "fgtrack"
 author = "fgtrack contributors"
 release = fgtrack.__version__
@@ -27,22 +25,8 @@ extensions = [
 ]
 root_doc = "docs/index"
 html_extra_path = ["_ext/index.html"]  # leads from out/docs/index.html to the root page
-include_patterns = [
-    "CHANGELOG.md",
-    "CONTRIBUTING.md",
-    "docs/**.md",
-    "docs/generated/**.rst",
-    "experiments/**.md",
-]
-exclude_patterns = [
-    ".venv",
-    ".git",
-    "out",
-    "build",
-    "tests",
-    "fgtrack",
-    "docs/tutorials",
-]
+include_patterns = ["CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "docs/generated/**.rst", "experiments/**.md"]
+exclude_patterns = [".venv", ".git", "out", "build", "tests", "fgtrack", "docs/tutorials"]
 html_theme = "furo"
 html_title = "fgtrack"
 html_show_copyright = False

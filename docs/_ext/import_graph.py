@@ -20,16 +20,9 @@ _X = {"testing": -4.4, "tracking": -2.2}  # beside the arrows that pass them
 
 def layers() -> list[list[str]]:
     """Return the folders of every layer, the highest first."""
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"][
-        "importlinter"
-    ]["contracts"]
-    [floors] = [
-        contract["layers"] for contract in contracts if contract["type"] == "layers"
-    ]
-    return [
-        [name.strip().removeprefix("fgtrack.") for name in floor.split("|")]
-        for floor in floors
-    ]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    [floors] = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
+    return [[name.strip().removeprefix("fgtrack.") for name in floor.split("|")] for floor in floors]
 
 
 def imports() -> tuple[Edges, Mapping[str, int]]:
@@ -39,11 +32,7 @@ def imports() -> tuple[Edges, Mapping[str, int]]:
     for module in sorted(graph.modules):
         own, *_ = [*module.split(".")[1:], ""]
         modules[own] = modules.get(own, 0) + 1
-        imported = {
-            name.split(".")[1]
-            for name in graph.find_modules_directly_imported_by(module)
-            if "." in name
-        }
+        imported = {name.split(".")[1] for name in graph.find_modules_directly_imported_by(module) if "." in name}
         for other in sorted(imported - {own}):
             edges[own, other] = edges.get((own, other), 0) + 1
     return edges, modules
@@ -53,9 +42,7 @@ def reduced(edges: Edges) -> Edges:
     """Return the edges that no longer path implies."""
 
     def reaches(start: str, end: str, direct: bool) -> bool:
-        following = [
-            other for one, other in edges if one == start and (direct or other != end)
-        ]
+        following = [other for one, other in edges if one == start and (direct or other != end)]
         return any(other == end or reaches(other, end, True) for other in following)
 
     return {pair: count for pair, count in edges.items() if not reaches(*pair, False)}
@@ -66,12 +53,7 @@ def described(edges: Edges) -> str:
     return ", ".join(sorted(f"{one} > {other}" for one, other in edges))
 
 
-def draw(
-    floors: Sequence[Sequence[str]],
-    edges: Edges,
-    modules: Mapping[str, int],
-    file: Path,
-) -> None:
+def draw(floors: Sequence[Sequence[str]], edges: Edges, modules: Mapping[str, int], file: Path) -> None:
     """Write the picture."""
     figure = Figure(figsize=(7.0, 5.6), layout="constrained")
     axes = figure.subplots()
@@ -80,36 +62,17 @@ def draw(
         for row, floor in enumerate(floors)
         for k, name in enumerate(floor)
     }
-    for (one, other), count in reduced(
-        {pair: n for pair, n in edges.items() if set(pair) <= set(at)}
-    ).items():
+    for (one, other), count in reduced({pair: n for pair, n in edges.items() if set(pair) <= set(at)}).items():
         (x, y), (to_x, to_y) = at[one], at[other]
-        arrow = {
-            "arrowstyle": "-|>",
-            "color": "0.45",
-            "lw": 0.6 + 0.12 * min(count, 20),
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
+        arrow = {"arrowstyle": "-|>", "color": "0.45", "lw": 0.6 + 0.12 * min(count, 20), "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (to_x, to_y + 0.24), (x, y - 0.24), arrowprops=arrow)
     for name, (x, y) in at.items():
         box = {"boxstyle": "round,pad=0.45", "fc": "#e8eef7", "ec": "#39557d"}
-        axes.text(
-            x,
-            y,
-            f"{name} ({modules[name]})",
-            ha="center",
-            va="center",
-            color="black",
-            bbox=box,
-        )
+        axes.text(x, y, f"{name} ({modules[name]})", ha="center", va="center", color="black", bbox=box)
     axes.set(xlim=(-6.0, 6.0), ylim=(-len(floors) + 0.5, 0.5))
     axes.axis("off")
     with rc_context({"svg.hashsalt": "fgtrack", "svg.fonttype": "none"}):
-        figure.savefig(
-            file,
-            metadata={"Date": None, "Creator": None, "Description": described(edges)},
-        )
+        figure.savefig(file, metadata={"Date": None, "Creator": None, "Description": described(edges)})
 
 
 def main() -> None:

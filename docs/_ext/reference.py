@@ -50,34 +50,20 @@ def sections(root: type, path: str = "") -> Iterator[Section]:
     yield from _sections(root, path, None, set())
 
 
-def _sections(
-    cls: type, path: str, kind: str | None, seen: set[type]
-) -> Iterator[Section]:
+def _sections(cls: type, path: str, kind: str | None, seen: set[type]) -> Iterator[Section]:
     if cls in seen:
         return
     seen.add(cls)
     hints, docs = get_type_hints(cls, include_extras=True), _attribute_docs(cls)
-    fields = [
-        field
-        for field in dataclasses.fields(cls)
-        if field.name != "kind" or _kind(cls) is None
-    ]
+    fields = [field for field in dataclasses.fields(cls) if field.name != "kind" or _kind(cls) is None]
     settings = [
-        Setting(
-            f.name,
-            _type(hints[f.name]),
-            _default(f),
-            docs.get(f.name) or _summary(hints[f.name]),
-        )
-        for f in fields
+        Setting(f.name, _type(hints[f.name]), _default(f), docs.get(f.name) or _summary(hints[f.name])) for f in fields
     ]
     yield Section(path, kind, inspect.getdoc(cls) or "", tuple(settings))
     for field in fields:
         inner = f"{path}.{field.name}" if path else field.name
         for below, choice, named in _dataclasses(hints[field.name]):
-            yield from _sections(
-                below, f"{inner}.{named}" if named else inner, choice, seen
-            )
+            yield from _sections(below, f"{inner}.{named}" if named else inner, choice, seen)
 
 
 def _dataclasses(hint: Any, named: str = "") -> Iterator[tuple[type, str | None, str]]:
@@ -90,9 +76,7 @@ def _dataclasses(hint: Any, named: str = "") -> Iterator[tuple[type, str | None,
     elif origin in (Union, types.UnionType):
         for one in get_args(hint):
             yield from _dataclasses(one, named)
-    elif origin in (tuple, list, Mapping, dict) or (
-        isinstance(origin, type) and issubclass(origin, Mapping)
-    ):
+    elif origin in (tuple, list, Mapping, dict) or (isinstance(origin, type) and issubclass(origin, Mapping)):
         for one in get_args(hint):
             yield from _dataclasses(one, "NAME" if origin not in (tuple, list) else "N")
 
@@ -102,21 +86,13 @@ def _summary(hint: Any) -> str:
     found = list(_dataclasses(hint))
     if len(found) > 1:
         return "Keys of each kind below."
-    return (
-        _one_line((inspect.getdoc(found[0][0]) or "").partition("\n\n")[0])
-        if found
-        else ""
-    )
+    return _one_line((inspect.getdoc(found[0][0]) or "").partition("\n\n")[0]) if found else ""
 
 
 def _kind(cls: type) -> str | None:
     """The value of `kind` that chooses this dataclass; None where there is no such choice."""
     hint = get_type_hints(cls).get("kind")
-    return (
-        str(get_args(hint)[0])
-        if get_origin(hint) is Literal and len(get_args(hint)) == 1
-        else None
-    )
+    return str(get_args(hint)[0]) if get_origin(hint) is Literal and len(get_args(hint)) == 1 else None
 
 
 def _type(hint: Any) -> str:
@@ -126,22 +102,13 @@ def _type(hint: Any) -> str:
     if origin is Literal:
         return " / ".join(f"`{value}`" for value in arguments)
     if origin in (Union, types.UnionType):
-        kinds = [
-            _kind(one)
-            if isinstance(one, type) and dataclasses.is_dataclass(one)
-            else None
-            for one in arguments
-        ]
+        kinds = [_kind(one) if isinstance(one, type) and dataclasses.is_dataclass(one) else None for one in arguments]
         if all(kinds):
             return "by `kind`: " + " / ".join(f"`{kind}`" for kind in kinds)
         return " / ".join(dict.fromkeys(_type(one) for one in arguments))
     if origin is tuple:
         inner = [one for one in arguments if one is not Ellipsis]
-        return (
-            f"list of {_type(inner[0])}"
-            if Ellipsis in arguments
-            else f"{len(inner)} x {_type(inner[0])}"
-        )
+        return f"list of {_type(inner[0])}" if Ellipsis in arguments else f"{len(inner)} x {_type(inner[0])}"
     if origin is not None and len(arguments) == 2:
         return f"{_type(arguments[0])} to {_type(arguments[1])}"
     if origin is not None:
@@ -150,12 +117,7 @@ def _type(hint: Any) -> str:
         return "null"
     if dataclasses.is_dataclass(hint):
         return "keys below"
-    return {
-        "str": "text",
-        "float": "number",
-        "int": "integer",
-        "bool": "true / false",
-    }.get(hint.__name__, "value")
+    return {"str": "text", "float": "number", "int": "integer", "bool": "true / false"}.get(hint.__name__, "value")
 
 
 def _default(field: "dataclasses.Field[Any]") -> str:
@@ -167,9 +129,7 @@ def _default(field: "dataclasses.Field[Any]") -> str:
     if dataclasses.is_dataclass(value):
         kind = _kind(type(value))
         return f"`{kind}`" if kind else ""
-    if isinstance(value, Mapping) and any(
-        dataclasses.is_dataclass(one) for one in value.values()
-    ):
+    if isinstance(value, Mapping) and any(dataclasses.is_dataclass(one) for one in value.values()):
         return ", ".join(f"`{name}`" for name in value)
     return f"`{_yaml(value)}`"
 
@@ -178,9 +138,7 @@ def _yaml(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, Mapping):
-        return (
-            "{" + ", ".join(f"{key}: {_yaml(one)}" for key, one in value.items()) + "}"
-        )
+        return "{" + ", ".join(f"{key}: {_yaml(one)}" for key, one in value.items()) + "}"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_yaml(one) for one in value) + "]"
     text = f"{value:.12g}" if isinstance(value, float) else str(value)
@@ -211,18 +169,10 @@ def settings_page(target: str) -> str:
     lines: list[str] = []
     for section in sections(getattr(import_module(module), name)):
         title = f"`{section.path}`" if section.path else "Top level"
-        lines += [
-            f"## {title}" + (f", kind `{section.kind}`" if section.kind else ""),
-            "",
-            section.doc,
-            "",
-        ]
+        lines += [f"## {title}" + (f", kind `{section.kind}`" if section.kind else ""), "", section.doc, ""]
         if section.settings:
             lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
-            lines += [
-                f"| `{one.name}` | {one.type} | {one.default} | {one.doc} |"
-                for one in section.settings
-            ]
+            lines += [f"| `{one.name}` | {one.type} | {one.default} | {one.doc} |" for one in section.settings]
             lines.append("")
     return "\n".join(lines)
 
@@ -236,9 +186,7 @@ def estimators_page() -> str:
         if name not in ESTIMATORS.sources():
             factory = ESTIMATORS.load(name)
             summary = _one_line((inspect.getdoc(factory) or "").partition("\n\n")[0])
-            lines.append(
-                f"| `{name}` | {summary} | {Claims.of(factory).exact or '-'} |"
-            )
+            lines.append(f"| `{name}` | {summary} | {Claims.of(factory).exact or '-'} |")
     return "\n".join(lines)
 
 
@@ -251,10 +199,9 @@ def motion_models_page() -> str:
         if name not in MOTION_MODELS.sources():
             model = MOTION_MODELS.load(name)
             summary = _one_line((inspect.getdoc(model) or "").partition("\n\n")[0])
-            entries, densities = (
-                ", ".join(f"`{each}`" for each in names)
-                for names in (model.state_names, model.density_names())
-            )
+            entries, densities = (", ".join(f"`{each}`" for each in names) for names in (
+                model.state_names, model.density_names()
+            ))
             lines.append(f"| `{name}` | {summary} | {entries} | {densities or '-'} |")
     return "\n".join(lines)
 
@@ -273,11 +220,7 @@ def public_names() -> str:
     """Autodoc directives of what `import fgtrack` offers."""
     import fgtrack
 
-    values = {
-        name: getattr(fgtrack, name)
-        for name in dir(fgtrack)
-        if not name.startswith("_")
-    }
+    values = {name: getattr(fgtrack, name) for name in dir(fgtrack) if not name.startswith("_")}
     lines = []
     for title, packages in _GROUPS.items():
         lines += [f"## {title}", ""]
@@ -289,37 +232,22 @@ def public_names() -> str:
 
 def _autodoc(name: str, value: Any) -> str:
     if isinstance(value, type):
-        return (
-            f".. autoclass:: fgtrack.{name}\n   :members:"
-            + "\n   :undoc-members:" * issubclass(value, Enum)
-        )
+        return f".. autoclass:: fgtrack.{name}\n   :members:" + "\n   :undoc-members:" * issubclass(value, Enum)
     if isinstance(value, types.ModuleType):
         import fgtrack
 
-        own = [
-            one for one in value.__all__ if one not in dir(fgtrack)
-        ]  # a public name has an entry of its own
+        own = [one for one in value.__all__ if one not in dir(fgtrack)]  # a public name has an entry of its own
         members = {one: getattr(value, one) for one in own}
-        return "\n\n".join(
-            _autodoc(f"{name}.{one}", member)
-            for one, member in members.items()
-            if callable(member)
-        )
+        return "\n\n".join(_autodoc(f"{name}.{one}", member) for one, member in members.items() if callable(member))
     if getattr(get_origin(value), "__name__", "") == "ndarray":
         numbers = get_args(get_args(value)[1])[0].__name__
-        return (
-            f".. py:data:: fgtrack.{name}\n\n   Type of a NumPy array of `{numbers}`."
-        )
+        return f".. py:data:: fgtrack.{name}\n\n   Type of a NumPy array of `{numbers}`."
     if callable(value):
         return f".. autofunction:: fgtrack.{name}"
-    return f".. py:data:: fgtrack.{name}\n\n   " + " or ".join(
-        f"`{one.__name__}`" for one in get_args(value)
-    )
+    return f".. py:data:: fgtrack.{name}\n\n   " + " or ".join(f"`{one.__name__}`" for one in get_args(value))
 
 
-def _whole_sentences(
-    app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]
-) -> None:
+def _whole_sentences(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
     """Break the line behind a colon: what stands before it is no type, as Napoleon has it for an attribute."""
     if what in ("attribute", "property") and lines:
         before, colon, behind = lines[0].partition(": ")
@@ -331,16 +259,12 @@ def setup(app: Any) -> dict[str, bool]:
     from docutils.nodes import Node
     from sphinx.util.docutils import SphinxDirective
 
-    def directive(
-        page: Callable[..., str], num_arguments: int
-    ) -> type[SphinxDirective]:
+    def directive(page: Callable[..., str], num_arguments: int) -> type[SphinxDirective]:
         class Generated(SphinxDirective):
             required_arguments = num_arguments
 
             def run(self) -> list[Node]:
-                return self.parse_text_to_nodes(
-                    page(*self.arguments), allow_section_headings=True
-                )
+                return self.parse_text_to_nodes(page(*self.arguments), allow_section_headings=True)
 
         return Generated
 
@@ -348,7 +272,5 @@ def setup(app: Any) -> dict[str, bool]:
     app.add_directive("estimators", directive(estimators_page, 0))
     app.add_directive("motion-models", directive(motion_models_page, 0))
     app.add_directive("public-names", directive(public_names, 0))
-    app.connect(
-        "autodoc-process-docstring", _whole_sentences, priority=100
-    )  # before Napoleon
+    app.connect("autodoc-process-docstring", _whole_sentences, priority=100)  # before Napoleon
     return {"parallel_read_safe": True}

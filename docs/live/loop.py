@@ -11,9 +11,7 @@ from dataclasses import replace
 import fgtrack
 
 PERIOD_NS = 20_000_000  # 50 Hz, as `clock.node_hz`
-PUBLISHED_AGO_NS = (
-    100_000_000  # waiting makes the tracks better: late detections have come by then
-)
+PUBLISHED_AGO_NS = 100_000_000  # waiting makes the tracks better: late detections have come by then
 
 Received = fgtrack.EgoState | fgtrack.DetectionList
 
@@ -25,17 +23,13 @@ def run(
     now_ns: Callable[[], int] = time.time_ns,
 ) -> None:
     """Track until the source ends; what it gives is stamped with its receipt by the clock `now_ns`."""
-    receiver = threading.Thread(
-        target=lambda: [tracker.receive(message) for message in source], daemon=True
-    )
+    receiver = threading.Thread(target=lambda: [tracker.receive(message) for message in source], daemon=True)
     receiver.start()
     while now_ns() == 0 and receiver.is_alive():  # simulated time has not begun
         time.sleep(0.001)
     due_ns = now_ns() // PERIOD_NS * PERIOD_NS
     while receiver.is_alive():
-        due_ns = max(
-            due_ns + PERIOD_NS, now_ns() // PERIOD_NS * PERIOD_NS
-        )  # after a long tick: skip some
+        due_ns = max(due_ns + PERIOD_NS, now_ns() // PERIOD_NS * PERIOD_NS)  # after a long tick: skip some
         while (left_ns := due_ns - now_ns()) > 0 and receiver.is_alive():
             time.sleep(min(left_ns / 1e9, 0.001))
         if left_ns > 0:
@@ -53,27 +47,16 @@ def drive(duration_s: float) -> Iterator[Received]:
             continue
         shift_ns = time.time_ns() - message.receipt_ns if shift_ns is None else shift_ns
         time.sleep(max(message.receipt_ns + shift_ns - time.time_ns(), 0) / 1e9)
-        yield replace(
-            message, stamp_ns=message.stamp_ns + shift_ns, receipt_ns=time.time_ns()
-        )
+        yield replace(message, stamp_ns=message.stamp_ns + shift_ns, receipt_ns=time.time_ns())
 
 
 def show(stamp_ns: int, tracks: tuple[fgtrack.TrackReport, ...]) -> None:
     """Instead of your topic."""
     for track in tracks:
-        print(
-            f"{stamp_ns} track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.status}"
-        )
+        print(f"{stamp_ns} track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.status}")
 
 
 if __name__ == "__main__":
     tracker = fgtrack.Tracker.from_config("smoother", map="oval")
     run(tracker, drive(duration_s=5.0), show)
-    print(
-        *tracker.lateness.items(),
-        tracker.timing,
-        tracker.counts,
-        tracker.refused,
-        tracker.failures,
-        sep="\n",
-    )
+    print(*tracker.lateness.items(), tracker.timing, tracker.counts, tracker.refused, tracker.failures, sep="\n")

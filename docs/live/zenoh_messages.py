@@ -28,22 +28,12 @@ def _make(kind: str, *fields: object) -> object:
 
 
 def _header(stamp_ns: int, frame_id: str) -> object:
-    return _make(
-        "std_msgs/msg/Header",
-        _make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9)),
-        frame_id,
-    )
+    return _make("std_msgs/msg/Header", _make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9)), frame_id)
 
 
 def _pose(x_m: float, y_m: float, yaw_rad: float = 0.0) -> object:
-    turned = _make(
-        "geometry_msgs/msg/Quaternion", 0.0, 0.0, sin(yaw_rad / 2.0), cos(yaw_rad / 2.0)
-    )
-    return _make(
-        "geometry_msgs/msg/Pose",
-        _make("geometry_msgs/msg/Point", x_m, y_m, 0.0),
-        turned,
-    )
+    turned = _make("geometry_msgs/msg/Quaternion", 0.0, 0.0, sin(yaw_rad / 2.0), cos(yaw_rad / 2.0))
+    return _make("geometry_msgs/msg/Pose", _make("geometry_msgs/msg/Point", x_m, y_m, 0.0), turned)
 
 
 def _vector(x: float = 0.0, z: float = 0.0) -> object:
@@ -54,15 +44,11 @@ def _stamp_ns(header: object) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def objects_to_cdr(
-    stamp_ns: int, frame_id: str, objects: Iterable[tuple[str, float, float, float]]
-) -> bytes:
+def objects_to_cdr(stamp_ns: int, frame_id: str, objects: Iterable[tuple[str, float, float, float]]) -> bytes:
     """`Detection3DArray` of objects with their id, x, y and yaw."""
     header, detections = _header(stamp_ns, frame_id), []
     for name, x_m, y_m, yaw_rad in objects:
-        box = _make(
-            "vision_msgs/msg/BoundingBox3D", _pose(x_m, y_m, yaw_rad), _vector()
-        )
+        box = _make("vision_msgs/msg/BoundingBox3D", _pose(x_m, y_m, yaw_rad), _vector())
         detections.append(_make("vision_msgs/msg/Detection3D", header, [], box, name))
     return bytes(TYPES.serialize_cdr(_make(LIST, header, detections), LIST))
 
@@ -70,23 +56,10 @@ def objects_to_cdr(
 def odometry_to_cdr(ego: fgtrack.EgoState) -> bytes:
     """`Odometry` in the map."""
     unknown = np.zeros(36)
-    pose = _make(
-        "geometry_msgs/msg/PoseWithCovariance",
-        _pose(ego.x_m, ego.y_m, ego.yaw_rad),
-        unknown,
-    )
-    twist = _make(
-        "geometry_msgs/msg/Twist",
-        _vector(x=ego.speed_mps),
-        _vector(z=ego.yaw_rate_radps),
-    )
+    pose = _make("geometry_msgs/msg/PoseWithCovariance", _pose(ego.x_m, ego.y_m, ego.yaw_rad), unknown)
+    twist = _make("geometry_msgs/msg/Twist", _vector(x=ego.speed_mps), _vector(z=ego.yaw_rate_radps))
     twist = _make("geometry_msgs/msg/TwistWithCovariance", twist, unknown)
-    return bytes(
-        TYPES.serialize_cdr(
-            _make(ODOMETRY, _header(ego.stamp_ns, "map"), "base_link", pose, twist),
-            ODOMETRY,
-        )
-    )
+    return bytes(TYPES.serialize_cdr(_make(ODOMETRY, _header(ego.stamp_ns, "map"), "base_link", pose, twist), ODOMETRY))
 
 
 def cdr_to_list(data: bytes, sensor: str, receipt_ns: int) -> fgtrack.DetectionList:
@@ -95,9 +68,7 @@ def cdr_to_list(data: bytes, sensor: str, receipt_ns: int) -> fgtrack.DetectionL
     centres = [detection.bbox.center.position for detection in message.detections]
     frame = "map" if message.header.frame_id == "map" else "ego"
     objects = [fgtrack.Detection(x_m=centre.x, y_m=centre.y) for centre in centres]
-    return fgtrack.DetectionList(
-        sensor, _stamp_ns(message.header), receipt_ns, objects, frame=frame
-    )
+    return fgtrack.DetectionList(sensor, _stamp_ns(message.header), receipt_ns, objects, frame=frame)
 
 
 def cdr_to_ego(data: bytes, receipt_ns: int) -> fgtrack.EgoState:
@@ -106,9 +77,7 @@ def cdr_to_ego(data: bytes, receipt_ns: int) -> fgtrack.EgoState:
     pose, twist = message.pose.pose, message.twist.twist
     yaw_rad = 2.0 * atan2(pose.orientation.z, pose.orientation.w)
     where = (pose.position.x, pose.position.y, yaw_rad)
-    return fgtrack.EgoState(
-        _stamp_ns(message.header), receipt_ns, *where, twist.linear.x, twist.angular.z
-    )
+    return fgtrack.EgoState(_stamp_ns(message.header), receipt_ns, *where, twist.linear.x, twist.angular.z)
 
 
 def stamp_of(data: bytes) -> int:

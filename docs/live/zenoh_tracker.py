@@ -52,9 +52,7 @@ class Inlet:
                     self.numbers.setdefault(of_topic, Numbers()).expect(count)
                 return
             try:
-                number, sent_ns = read_attachment(
-                    sample.attachment.to_bytes() if sample.attachment else b""
-                )
+                number, sent_ns = read_attachment(sample.attachment.to_bytes() if sample.attachment else b"")
                 self.numbers.setdefault(topic, Numbers()).add(number)
                 self._vehicle_ns = max(self._vehicle_ns, sent_ns)
                 if topic == ODOMETRY:
@@ -69,53 +67,34 @@ def main() -> None:
     """Track until the vehicle has sent everything, and report the outcome."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447")
-    parser.add_argument(
-        "--sim-time", action="store_true", help="by the clock of the vehicle"
-    )
+    parser.add_argument("--sim-time", action="store_true", help="by the clock of the vehicle")
     parser.add_argument("--estimator", default="smoother-banded")
     arguments = parser.parse_args()
     config = zenoh.Config()
     config.insert_json5("listen/endpoints", json.dumps([arguments.listen]))
     config.insert_json5("scouting/multicast/enabled", "false")
-    tracker = fgtrack.Tracker.from_config(
-        "smoother", map="oval", estimator=arguments.estimator
-    )
+    tracker = fgtrack.Tracker.from_config("smoother", map="oval", estimator=arguments.estimator)
     inlet = Inlet(arguments.sim_time)
     with zenoh.open(config) as session:
-        tracks = session.declare_publisher(
-            "tracks", congestion_control=zenoh.CongestionControl.BLOCK
-        )
+        tracks = session.declare_publisher("tracks", congestion_control=zenoh.CongestionControl.BLOCK)
 
         def publish(stamp_ns: int, reports: tuple[fgtrack.TrackReport, ...]) -> None:
-            found = [
-                (str(track.track_id), track.x_m, track.y_m, track.yaw_rad)
-                for track in reports
-            ]
+            found = [(str(track.track_id), track.x_m, track.y_m, track.yaw_rad) for track in reports]
             tracks.put(objects_to_cdr(stamp_ns, "map", found))
 
         # a full channel makes the vehicle wait
-        with session.declare_subscriber(
-            "vehicle/**", zenoh.handlers.FifoChannel(1000)
-        ) as subscriber:
+        with session.declare_subscriber("vehicle/**", zenoh.handlers.FifoChannel(1000)) as subscriber:
             print("ready", flush=True)
             run(tracker, inlet.messages(subscriber), publish, inlet.now_ns)
         summary = {
-            "received": {
-                topic: numbers.received for topic, numbers in inlet.numbers.items()
-            },
-            "lost": {
-                topic: len(numbers.missing) for topic, numbers in inlet.numbers.items()
-            },
-            "repeated": {
-                topic: numbers.repeated for topic, numbers in inlet.numbers.items()
-            },
+            "received": {topic: numbers.received for topic, numbers in inlet.numbers.items()},
+            "lost": {topic: len(numbers.missing) for topic, numbers in inlet.numbers.items()},
+            "repeated": {topic: numbers.repeated for topic, numbers in inlet.numbers.items()},
             "unreadable": inlet.unreadable,
             "counts": tracker.counts,
             "refused": tracker.refused,
             "failures": tracker.failures,
-            "delay_median_s": {
-                sensor: late.delay_median_s for sensor, late in tracker.lateness.items()
-            },
+            "delay_median_s": {sensor: late.delay_median_s for sensor, late in tracker.lateness.items()},
             "timing": asdict(tracker.timing),
         }
         session.put("tracker/summary", json.dumps(summary))

@@ -36,18 +36,10 @@ class Tracks:
     def wait_for(self, stamp_ns: int) -> None:
         """Come back when tracks of this stamp or later have come; after a second in any case."""
         with self._news:
-            self._news.wait_for(
-                lambda: self.stamps_ns and self.stamps_ns[-1] >= stamp_ns, timeout=1.0
-            )
+            self._news.wait_for(lambda: self.stamps_ns and self.stamps_ns[-1] >= stamp_ns, timeout=1.0)
 
 
-def drive(
-    session: zenoh.Session,
-    tracks: Tracks,
-    duration_s: float,
-    max_lists: int,
-    lose_every: int,
-) -> Counter[str]:
+def drive(session: zenoh.Session, tracks: Tracks, duration_s: float, max_lists: int, lose_every: int) -> Counter[str]:
     """Send the messages of a drive; gives how many, by topic, those that `lose_every` loses on purpose included."""
     publishers: dict[str, zenoh.Publisher] = {}
     sent: Counter[str] = Counter()
@@ -62,26 +54,17 @@ def drive(
                 break
             lists += 1
             topic = f"vehicle/lists/{message.sensor}"
-            objects = [
-                (str(k), seen.x_m, seen.y_m, seen.yaw_rad or 0.0)
-                for k, seen in enumerate(message.objects)
-            ]
+            objects = [(str(k), seen.x_m, seen.y_m, seen.yaw_rad or 0.0) for k, seen in enumerate(message.objects)]
             data = objects_to_cdr(message.stamp_ns, "base_link", objects)
         begun_ns = message.receipt_ns if begun_ns is None else begun_ns
         if message.receipt_ns > begun_ns + AHEAD_NS:
             tracks.wait_for(message.receipt_ns - AHEAD_NS)
-        if (
-            topic not in publishers
-        ):  # wait rather than drop, where the network is slower than we are
-            publishers[topic] = session.declare_publisher(
-                topic, congestion_control=zenoh.CongestionControl.BLOCK
-            )
+        if topic not in publishers:  # wait rather than drop, where the network is slower than we are
+            publishers[topic] = session.declare_publisher(topic, congestion_control=zenoh.CongestionControl.BLOCK)
             while not publishers[topic].matching_status.matching:
                 time.sleep(0.01)
         if not lose_every or sent[topic] % lose_every != lose_every - 1:
-            publishers[topic].put(
-                data, attachment=attachment(sent[topic], message.receipt_ns)
-            )
+            publishers[topic].put(data, attachment=attachment(sent[topic], message.receipt_ns))
         sent[topic] += 1
     return sent
 
@@ -92,12 +75,7 @@ def main() -> None:
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447")
     parser.add_argument("--duration-s", type=float, default=60.0)
     parser.add_argument("--max-lists", type=int, default=-1)
-    parser.add_argument(
-        "--lose-every",
-        type=int,
-        default=0,
-        help="lose each n-th message, to see it noticed",
-    )
+    parser.add_argument("--lose-every", type=int, default=0, help="lose each n-th message, to see it noticed")
     arguments = parser.parse_args()
     config = zenoh.Config()
     config.insert_json5("connect/endpoints", json.dumps([arguments.connect]))
@@ -110,29 +88,11 @@ def main() -> None:
         session.declare_subscriber("tracks", tracks.take),
         session.declare_subscriber("tracker/summary", lambda _: done.set()),
     ):
-        sent = drive(
-            session,
-            tracks,
-            arguments.duration_s,
-            arguments.max_lists,
-            arguments.lose_every,
-        )
+        sent = drive(session, tracks, arguments.duration_s, arguments.max_lists, arguments.lose_every)
         while not done.wait(0.5):  # the last ones might be lost, too
-            session.put(
-                "vehicle/sent",
-                json.dumps(sent),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
+            session.put("vehicle/sent", json.dumps(sent), congestion_control=zenoh.CongestionControl.BLOCK)
     stamps_ns = tracks.stamps_ns
-    print(
-        json.dumps(
-            {
-                "sent": sent,
-                "tracks": len(stamps_ns),
-                "in_order": stamps_ns == sorted(stamps_ns),
-            }
-        )
-    )
+    print(json.dumps({"sent": sent, "tracks": len(stamps_ns), "in_order": stamps_ns == sorted(stamps_ns)}))
 
 
 if __name__ == "__main__":

@@ -9,9 +9,7 @@ import matplotlib.pyplot as plt
 
 import fgtrack
 
-recording = list(
-    fgtrack.simulate("single_opponent", seed=1, duration_s=6.0)
-)  # or a path: "drive.mcap"
+recording = list(fgtrack.simulate("single_opponent", seed=1, duration_s=6.0))  # or a path: "drive.mcap"
 run = fgtrack.replay(recording, "smoother", map="oval")
 delay_ms = (run.updates["receipt_ns"] - run.updates["stamp_ns"]) / 1e6
 figure, axes = plt.subplots()

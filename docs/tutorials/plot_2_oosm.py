@@ -41,9 +41,7 @@ class ShiftedInnovation:
         model, pose = measurement.model, measurement.pose
         then = model.predict(self.state_at(measurement.stamp_ns).mean, pose)
         now = model.predict(self.state_at(newest_ns).mean, pose)
-        shifted = replace(
-            measurement, stamp_ns=newest_ns, z=now + model.residual(measurement.z, then)
-        )
+        shifted = replace(measurement, stamp_ns=newest_ns, z=now + model.residual(measurement.z, then))
         result = self._filter.update(shifted)
         if result.status == fgtrack.UpdateStatus.IN_SEQUENCE:
             result = replace(result, status=fgtrack.UpdateStatus.OUT_OF_SEQUENCE)
@@ -74,18 +72,10 @@ arrivals = []
 for delay_ms, std_m, phase_ms in ((150, 0.3, 0), (60, 1.0, 20)):
     for stamp_ms in range(50 + phase_ms, 10_000, 50):
         x_m, y_m = truth(stamp_ms / 1e3) + std_m * rng.standard_normal(2)
-        measurement = fgtrack.Measurement.of(
-            stamp_ms * MS, x_m=x_m, y_m=y_m, std={"x_m": std_m, "y_m": std_m}
-        )
+        measurement = fgtrack.Measurement.of(stamp_ms * MS, x_m=x_m, y_m=y_m, std={"x_m": std_m, "y_m": std_m})
         arrivals.append((stamp_ms + delay_ms, measurement))
 arrivals.sort(key=lambda arrival: arrival[0])
-start = fgtrack.Start(
-    yaw_rad=0.0,
-    yaw_std_rad=0.1,
-    speed_mps=60.0,
-    speed_std_mps=5.0,
-    yaw_rate_std_radps=0.3,
-)
+start = fgtrack.Start(yaw_rad=0.0, yaw_std_rad=0.1, speed_mps=60.0, speed_std_mps=5.0, yaw_rate_std_radps=0.3)
 
 
 def errors_m(estimator):
@@ -94,21 +84,13 @@ def errors_m(estimator):
     for now_ms, measurement in arrivals:
         estimator.update(measurement)
         x_m, y_m = estimator.state_at(now_ms * MS).mean[:2]
-        found.append(
-            (
-                now_ms / 1e3,
-                np.hypot(x_m - truth(now_ms / 1e3)[0], y_m - truth(now_ms / 1e3)[1]),
-            )
-        )
+        found.append((now_ms / 1e3, np.hypot(x_m - truth(now_ms / 1e3)[0], y_m - truth(now_ms / 1e3)[1])))
     return np.array([row for row in found if row[0] > 1.0])
 
 
 # %%
 # The result, beside methods that come with fgtrack.
-methods = {
-    name: fgtrack.estimator(name, motion, start, lag_s=1.0)
-    for name in ("ekf-replay", "rewind-forget", "drop")
-}
+methods = {name: fgtrack.estimator(name, motion, start, lag_s=1.0) for name in ("ekf-replay", "rewind-forget", "drop")}
 methods["shifted innovation"] = ShiftedInnovation(motion, start, 1.0)
 
 figure, axes = plt.subplots()

@@ -26,19 +26,14 @@ for message in messages:
         now_ns = message.receipt_ns + PERIOD_NS
     while message.receipt_ns > now_ns:
         report = tracker.tick(now_ns)
-        rows += [
-            (now_ns, track.track_id, track.speed_mps, track.covariance[3, 3])
-            for track in report.tracks
-        ]
+        rows += [(now_ns, track.track_id, track.speed_mps, track.covariance[3, 3]) for track in report.tracks]
         now_ns += PERIOD_NS
     tracker.receive(message)
 
 # %%
 # Tracks have their state by name, and a covariance.
 for track in report.tracks:
-    print(
-        f"track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.speed_mps:.1f} m/s, {track.status}"
-    )
+    print(f"track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.speed_mps:.1f} m/s, {track.status}")
 
 # %%
 # The state at any stamp in the window, not only now: the smoothed state 0.3 s ago.
@@ -51,9 +46,7 @@ print(len(tracker.tracks_at(now_ns - 100_000_000)))
 
 # %%
 # A sensor without a configuration, and a clock that runs backwards: counted, with a reason.
-stranger = fgtrack.DetectionList(
-    "sonar", now_ns, now_ns, (fgtrack.Detection(x_m=1.0, y_m=0.0),)
-)
+stranger = fgtrack.DetectionList("sonar", now_ns, now_ns, (fgtrack.Detection(x_m=1.0, y_m=0.0),))
 tracker.receive(stranger)
 tracker.tick(now_ns)
 tracker.tick(now_ns - PERIOD_NS)
@@ -68,24 +61,13 @@ for sensor, counts in tracker.counts.items():
 # How late every sensor is.
 for sensor, late in tracker.lateness.items():
     if late.messages:
-        print(
-            f"{sensor}: median {late.delay_median_s:.3f} s, worst {late.delay_worst_s:.3f} s"
-        )
+        print(f"{sensor}: median {late.delay_median_s:.3f} s, worst {late.delay_worst_s:.3f} s")
 
 # %%
 time_s = (np.array([row[0] for row in rows]) - rows[0][0]) / 1e9
-speed_mps, std_mps = (
-    np.array([row[2] for row in rows]),
-    np.sqrt([row[3] for row in rows]),
-)
+speed_mps, std_mps = np.array([row[2] for row in rows]), np.sqrt([row[3] for row in rows])
 figure, axes = plt.subplots()
-axes.fill_between(
-    time_s,
-    speed_mps - 2 * std_mps,
-    speed_mps + 2 * std_mps,
-    alpha=0.3,
-    label="two standard deviations",
-)
+axes.fill_between(time_s, speed_mps - 2 * std_mps, speed_mps + 2 * std_mps, alpha=0.3, label="two standard deviations")
 axes.plot(time_s, speed_mps, label="track")
 axes.set(xlabel="time [s]", ylabel="speed [m/s]")
 axes.legend()

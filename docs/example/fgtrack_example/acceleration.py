@@ -25,21 +25,9 @@ class Acceleration(MotionModel):
 
     def process_noise(self, x, dt_s):
         t = self.durations(x, self.forward(dt_s))
-        rows = [
-            [t**5 / 20, t**4 / 8, t**3 / 6],
-            [t**4 / 8, t**3 / 3, t**2 / 2],
-            [t**3 / 6, t**2 / 2, t],
-        ]
-        Q = np.concatenate(
-            [
-                np.concatenate([part * np.eye(2) for part in row], axis=-1)
-                for row in rows
-            ],
-            axis=-2,
-        )
+        rows = [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
+        Q = np.concatenate([np.concatenate([part * np.eye(2) for part in row], axis=-1) for row in rows], axis=-2)
         return self.jerk_density_m2ps5 * Q
 
     def durations(self, x, dt_s):
-        return np.broadcast_to(dt_s, np.broadcast_shapes(x.shape[:-1], np.shape(dt_s)))[
-            ..., None, None
-        ]
+        return np.broadcast_to(dt_s, np.broadcast_shapes(x.shape[:-1], np.shape(dt_s)))[..., None, None]

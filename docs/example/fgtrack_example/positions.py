@@ -17,9 +17,7 @@ def is_positions(path):
 def read_positions(path):
     """Yield a list of detections for each scan: the lines of one time and sensor, in the map frame."""
     lines = path.read_text().splitlines()[1:]
-    for (seconds, sensor), scan in groupby(
-        map(str.split, lines), key=lambda words: words[:2]
-    ):
+    for (seconds, sensor), scan in groupby(map(str.split, lines), key=lambda words: words[:2]):
         stamp_ns = int(Decimal(seconds) * 10**9)
         objects = [Detection(x_m=float(x_m), y_m=float(y_m)) for _, _, x_m, y_m in scan]
         yield DetectionList(sensor, stamp_ns, stamp_ns, objects, frame="map")

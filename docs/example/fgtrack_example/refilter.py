@@ -36,9 +36,7 @@ class Refilter:
         measurement = measurement.seen_by(self.motion)
         y, _, S = self.innovation(self.state_at(measurement.stamp_ns), measurement)
         self.measurements.append(measurement)
-        self.measurements.sort(
-            key=lambda m: (m.stamp_ns, m.model.components, m.z.tolist())
-        )
+        self.measurements.sort(key=lambda m: (m.stamp_ns, m.model.components, m.z.tolist()))
         self.window_ns = (oldest_ns, max(newest_ns, measurement.stamp_ns))
         self.advance(self.window_ns[1])
         late = measurement.stamp_ns < newest_ns
@@ -49,46 +47,30 @@ class Refilter:
         state = self.first
         for measurement in self.measurements:
             if measurement.stamp_ns <= stamp_ns:
-                state = self.corrected(
-                    self.predicted(state, measurement.stamp_ns), measurement
-                )
+                state = self.corrected(self.predicted(state, measurement.stamp_ns), measurement)
         return self.predicted(state, stamp_ns)
 
     def advance(self, now_ns: int) -> None:
-        self.window_ns = (
-            max(self.window_ns[0], now_ns - self.lag_ns),
-            self.window_ns[1],
-        )
+        self.window_ns = (max(self.window_ns[0], now_ns - self.lag_ns), self.window_ns[1])
         while self.measurements and self.measurements[0].stamp_ns < self.window_ns[0]:
             measurement = self.measurements.pop(0)
-            self.first = self.corrected(
-                self.predicted(self.first, measurement.stamp_ns), measurement
-            )
+            self.first = self.corrected(self.predicted(self.first, measurement.stamp_ns), measurement)
 
     def predicted(self, state: TrackState, stamp_ns: int) -> TrackState:
         dt_s = (stamp_ns - state.stamp_ns) / 1e9
-        F, Q = (
-            self.motion.jacobian(state.mean, dt_s),
-            self.motion.process_noise(state.mean, dt_s),
-        )
+        F, Q = self.motion.jacobian(state.mean, dt_s), self.motion.process_noise(state.mean, dt_s)
         P = F @ state.covariance @ F.T + Q
-        return TrackState(
-            stamp_ns, self.motion.predict(state.mean, dt_s), (P + P.T) / 2
-        )
+        return TrackState(stamp_ns, self.motion.predict(state.mean, dt_s), (P + P.T) / 2)
 
     def corrected(self, state: TrackState, measurement: Measurement) -> TrackState:
         y, H, S = self.innovation(state, measurement)
-        R = measurement.R / robust_weight(
-            measurement.loss, y, S - measurement.R, measurement.R
-        )
+        R = measurement.R / robust_weight(measurement.loss, y, S - measurement.R, measurement.R)
         K = np.linalg.solve(S - measurement.R + R, H @ state.covariance).T
         A = np.eye(len(state.mean)) - K @ H
         P = A @ state.covariance @ A.T + K @ R @ K.T
         return TrackState(state.stamp_ns, state.mean + K @ y, (P + P.T) / 2)
 
-    def innovation(
-        self, state: TrackState, measurement: Measurement
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def innovation(self, state: TrackState, measurement: Measurement) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model, pose = measurement.model, measurement.pose
         H = model.jacobian(state.mean, pose)
         y = model.residual(measurement.z, model.predict(state.mean, pose))
