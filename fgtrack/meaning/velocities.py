@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.meaning.decision import Certainty
-from fgtrack.meaning.tracklets import Motions
+from fgtrack.meaning.motions import Motions
 
 __all__ = ["SPEED_UNITS", "VelocityKind", "VelocityMeaning", "by_name", "meaning_of"]
 
@@ -38,7 +38,7 @@ _RADIAL = frozenset(
 )
 _OVER_GROUND = frozenset(("compensated", "comp", "corrected", "abs", "absolute"))
 _COMPONENT = frozenset(("x", "long", "longitudinal", "lon"))
-#: Fewest tracklets for a test.
+#: Fewest straight paths for a test.
 _FEWEST = 8
 #: A hypothesis is refuted if it differs by more than the largest of these: a velocity, standard deviations of the
 #: velocity from positions, and a share of the typical velocity.

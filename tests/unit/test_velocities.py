@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import FloatArray
-from fgtrack.meaning.tracklets import Motions, Scans, motions, tracklets
+from fgtrack.meaning.motions import Motions, Scans, motions, straight_paths
 from fgtrack.meaning.velocities import VelocityMeaning, by_name, meaning_of
 
 EGO_MPS = 12.0
@@ -82,7 +82,7 @@ def recorded(
 
 
 def meaning(scans: Scans, *names: str, unit: str | None = None) -> VelocityMeaning:
-    measured: Motions = motions(scans, tracklets(scans))
+    measured: Motions = motions(scans, straight_paths(scans))
     return meaning_of(measured, by_name([name.split("_") for name in names]), unit)
 
 
@@ -158,7 +158,7 @@ def test_other_rates_and_noisy_positions_give_the_same_kind(
 
 
 def test_a_tracklet_has_the_velocity_of_its_object() -> None:
-    found = tracklets(recorded("speed", position_std_m=0.01, clutter=0))
+    found = straight_paths(recorded("speed", position_std_m=0.01, clutter=0))
     truth: FloatArray = np.array(
         [[v * math.cos(a), v * math.sin(a)] for _, _, a, v in OBJECTS]
     )

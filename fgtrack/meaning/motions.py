@@ -1,4 +1,4 @@
-"""Short straight paths of objects, linked from list to list, and the motions that a sensor could report for them."""
+"""Straight paths of objects, linked from list to list, and the motions that a sensor could report for them."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from fgtrack.core.geometry import rotations
 from fgtrack.core.types import FloatArray, IntArray
 
-__all__ = ["Motions", "Scans", "Tracklet", "motions", "tracklets"]
+__all__ = ["Motions", "Scans", "StraightPath", "motions", "straight_paths"]
 
 #: Highest speed of an object, and of an object that moves as the ego does.
 _FASTEST_MPS = 90.0
@@ -17,13 +17,13 @@ _FASTEST_MPS = 90.0
 _LARGEST_ERROR_M = 3.0
 #: Largest acceleration across or along a path.
 _LARGEST_ACCELERATION_MPS2 = 6.0
-#: Duration of a tracklet, and its fewest and most detections.
+#: Duration of a path, and its fewest and most detections.
 _DURATION_S = 1.0
 _FEWEST_POINTS = 5
 _MOST_POINTS = 30
-#: Most tracklets.
+#: Most straight paths.
 _MOST = 400
-#: A tracklet whose scatter is larger than this multiple of the median has a wrong link.
+#: A path whose scatter is larger than this multiple of the median has a wrong link.
 _WRONG_LINK = 3.0
 #: Half of the time over which the velocity of the frame is computed.
 _STEP_S = 0.25
@@ -53,7 +53,7 @@ class Scans:
 
 
 @dataclass(frozen=True)
-class Tracklet:
+class StraightPath:
     """Successive detections of an object on a straight line at constant speed."""
 
     lists: IntArray
@@ -70,7 +70,7 @@ class Tracklet:
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of the tracklets of a sensor, and the means of the raw values beside them."""
+    """Motions of the straight paths of a sensor, and the means of the raw values beside them."""
 
     values: FloatArray
     """Mean raw values, shape (m, k)."""
@@ -92,10 +92,12 @@ class Motions:
     """Standard deviation of the velocities on each axis."""
 
 
-def tracklets(scans: Scans, ids: Sequence[IntArray] | None = None) -> list[Tracklet]:
-    """Return up to 400 tracklets that begin all over the recording.
+def straight_paths(
+    scans: Scans, ids: Sequence[IntArray] | None = None
+) -> list[StraightPath]:
+    """Return up to 400 straight paths that begin all over the recording.
 
-    Three detections in successive lists begin a tracklet if they are closest to a
+    Three detections in successive lists begin a path if they are closest to a
     straight line. The next lists continue it with their detection next to the line.
     With `ids`, shape (m,) for each list, equal ids are linked instead.
     """
@@ -120,7 +122,7 @@ def tracklets(scans: Scans, ids: Sequence[IntArray] | None = None) -> list[Track
             else _of_equal_ids([ids[k] for k in window])
         )
         found += [
-            _tracklet(start + steps, rows, stamps_s[steps], in_map_m, steps)
+            _straight_path(start + steps, rows, stamps_s[steps], in_map_m, steps)
             for steps, rows in linked
         ]
     if not found:
@@ -193,24 +195,24 @@ def _line(times_s: FloatArray, points_m: FloatArray) -> tuple[FloatArray, FloatA
     return mean_m, centred_s @ (points_m - mean_m) / max(spread_s2, 1e-12)
 
 
-def _tracklet(
+def _straight_path(
     lists: IntArray,
     rows: IntArray,
     times_s: FloatArray,
     in_map_m: Sequence[FloatArray],
     steps: IntArray,
-) -> Tracklet:
+) -> StraightPath:
     points_m = np.array([in_map_m[k][row] for k, row in zip(steps, rows, strict=True)])
     mean_m, slope_mps = _line(times_s, points_m)
     centred_s = times_s - times_s.mean()
     rest_m = points_m - mean_m - centred_s[:, None] * slope_mps
     scatter_m = math.sqrt(float(np.square(rest_m).sum()) / (2.0 * (len(rows) - 2)))
     spread_s = math.sqrt(max(float(centred_s @ centred_s), 1e-12))
-    return Tracklet(lists, rows, slope_mps, scatter_m, scatter_m / spread_s)
+    return StraightPath(lists, rows, slope_mps, scatter_m, scatter_m / spread_s)
 
 
-def motions(scans: Scans, found: Sequence[Tracklet]) -> Motions:
-    """Return the motions of the tracklets `found`, each as the mean over its detections."""
+def motions(scans: Scans, found: Sequence[StraightPath]) -> Motions:
+    """Return the motions of the straight paths `found`, each as the mean over its detections."""
     rates = _rates(scans)
     rows = [_motion(scans, rates, one) for one in found]
     width = scans.values[0].shape[1] if len(scans.values) else 0
@@ -228,8 +230,8 @@ def motions(scans: Scans, found: Sequence[Tracklet]) -> Motions:
     )
 
 
-def _motion(scans: Scans, rates: FloatArray, one: Tracklet) -> FloatArray:
-    """Return the means over the detections of a tracklet, in the order of the fields of `Motions`."""
+def _motion(scans: Scans, rates: FloatArray, one: StraightPath) -> FloatArray:
+    """Return the means over the detections of a path, in the order of the fields of `Motions`."""
     pairs = list(zip(one.lists.tolist(), one.rows.tolist(), strict=True))
     values = np.array([scans.values[k][row] for k, row in pairs])
     local_m = np.array([scans.positions_m[k][row] for k, row in pairs])
