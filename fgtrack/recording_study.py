@@ -30,9 +30,8 @@ from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.tables import Tables, short
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.meaning.assumed import assumed
 from fgtrack.meaning.assumption import Assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import drafted
 from fgtrack.noise.measurements import MeasurementRecorder
 from fgtrack.pipeline.replay import replay
 from fgtrack.runs import Run, check_run, load_run, write_metrics
@@ -212,15 +211,14 @@ def study(
         check_output(settings, overwrite)
         check_output(page, overwrite)
         on_step("reading", 0.0)
-        source = open_recording(source_path, resolved.input)
-        readable = UntilBreak(source.messages())
+        draft = drafted(source_path, resolved)
+        readable = UntilBreak(draft.source.messages())
         messages = list(readable)
-        known = assumed(resolved, replace(source, messages=lambda: iter(messages)))
         advised: Advice | None = None
         adviser = Adviser(
             str(source_path),
             messages,
-            Assumed(known.config),
+            Assumed(draft.config),
             on_step=lambda text, share: on_step(
                 f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share
             ),
@@ -229,15 +227,13 @@ def study(
             advised = adviser.advice() if advice else None
         if advised is not None:  # settings from the advice are no assumptions
             changed = {one.key for one in advised.changes}
-            known = Assumed(
-                advised.config,
-                tuple(one for one in known.assumptions if one.key not in changed),
-            )
+            kept = [one for one in draft.assumed.assumptions if one.key not in changed]
+            draft = draft.with_assumed(Assumed(advised.config, tuple(kept)))
         head = [
             f"Settings of {source_path.name} (fgtrack study): change them and pass this file with -c."
         ]
         comments = [] if advised is None else advised.comments()
-        write_file(settings, known.to_yaml([*head, *comments]), overwrite)
+        write_file(settings, draft.to_yaml([*head, *comments]), overwrite)
 
         taken = count()
 
@@ -250,13 +246,13 @@ def study(
                 yield message
             readable.raise_error()
 
-        recorder = MeasurementRecorder(replace(known.config, estimator=REPLAY))
+        recorder = MeasurementRecorder(replace(draft.config, estimator=REPLAY))
         replay(
             repeated,
-            known.config,
+            draft.config,
             folders,
-            origin=str(source.path),
-            kind=source.kind,
+            origin=str(source_path),
+            kind=draft.source.kind,
             overwrite=overwrite,
             observed={REPLAY: recorder},
         )
@@ -269,7 +265,7 @@ def study(
             replays = PairedReplay(
                 recorder.bank,
                 every[ESTIMATORS.index(REPLAY)].run,
-                known.config,
+                draft.config,
                 SUMMARY_S,
             )
             tables = replace(
@@ -297,7 +293,7 @@ def study(
         report_head = replace(
             head_at(late),
             sentences=lines,
-            assumptions=known.lines(),
+            assumptions=draft.lines(),
             advice=head_advice,
         )
         write_report(every, tables, images, page, report_head, overwrite)
@@ -306,7 +302,7 @@ def study(
     return Study(
         out,
         lines,
-        tuple(known.lines()),
+        tuple(draft.lines()),
         advised,
         result,
         tables,

@@ -29,10 +29,10 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.errors import UntilBreak
-from fgtrack.meaning.assumed import assumed, source_of
+from fgtrack.meaning.assumed import source_of
 from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.draft import drafted
 from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
-from fgtrack.meaning.reports import open_recording
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.clock import corrected
@@ -83,11 +83,11 @@ def advise(
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
-    source = open_recording(recording, resolved.input)
-    readable = UntilBreak(source.messages())
+    draft = drafted(recording, resolved)
+    readable = UntilBreak(draft.source.messages())
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
-    result = assumed(resolved, replace(source, messages=lambda: iter(messages)))
+    result = Assumed(draft.config, draft.assumed.assumptions)
     return Adviser(str(recording), messages, result, reference, on_step).advice(
         broken, tune, ledger
     )

@@ -23,7 +23,7 @@ from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value, short
 from fgtrack.meaning.assumed import assumed, source_of
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened
 from fgtrack.noise.measurements import BankCall
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.runs import load_run
@@ -105,7 +105,9 @@ def ledger(
                 raise DataError(
                     f"{recording}: its recording is not at {path}; give the recording's path with -c {run.config_path}"
                 )
-        recording = open_recording(path, settings.input).messages()
+        draft = opened(path, settings)
+        settings = draft.config
+        recording = draft.source.messages()
     messages = list(recording)
     settings = assumed(settings, source_of(lambda: messages)).config
     fitted = settings if tuned is None else read_config(tuned)

@@ -35,8 +35,9 @@ from fgtrack.evaluation.tables import NO_VALUE, Column, Table
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.info import InputInfo, describe
 from fgtrack.inputs.settings import InputConfig
-from fgtrack.meaning.assumed import assumed
+from fgtrack.inputs.source import input_kind
 from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.draft import Draft, drafted, opened
 from fgtrack.meaning.input_checks import (
     TRIAL_S,
     counted_lines,
@@ -44,8 +45,6 @@ from fgtrack.meaning.input_checks import (
     input_checks,
     messages_within,
 )
-from fgtrack.meaning.reports import open_recording, reports
-from fgtrack.meaning.starting_config import starting_config
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.replay import Feed, with_origin
 
@@ -75,19 +74,14 @@ def info(
             )
         check_output(write, overwrite)
         check_no_overlap(write, [recording])
-        text = starting_config(recording)
-        write_file(write, text, overwrite)
+        draft = drafted(recording)
+        write_file(write, draft.to_yaml(_head(draft)), overwrite)
         if not as_json:
             say(f"{write}: written; check the guesses, which are applied below")
         config_file = str(write)
     config = None if config_file is None else read_config(config_file)
-    if config is not None:
-        result = describe(recording, config.input)
-    else:
-        tables = reports(recording)
-        result = describe(
-            recording, None if tables is None else InputConfig(csv=tables)
-        )
+    read = _drafted_input(recording) if config is None else config.input
+    result = describe(recording, read)
     topics = _topics(result, NO_VALUE if config is None else "ignored")
     effective = (config or Config()).effective
     problem = result.problem
@@ -119,7 +113,7 @@ def info(
         if config is None and suited is None:
             # Without a configuration, topics or columns may be unknown.
             with suppress(FgtrackError), progress("detections"):
-                sentences(assumed(Config(), open_recording(recording)).lines())
+                sentences(drafted(recording).lines())
         elif config is not None and problem is None:
             problem = _try_out(recording, config)
     if problem is not None:
@@ -129,23 +123,39 @@ def info(
 def _try_out(recording: Path, config: Config) -> str | None:
     """Print the contents of the first seconds as the configuration reads them; return the recording's problem."""
     with progress("first seconds"):
-        source = open_recording(recording, config.input)
-        result = assumed(config, source)
-        build_road(
-            result.config.map, result.config.defects
-        )  # raises if files are missing
-        readable = UntilBreak(source.messages())
+        draft = drafted(recording, config)
+        result = draft.config
+        build_road(result.map, result.defects)  # raises if files are missing
+        readable = UntilBreak(draft.source.messages())
         messages = list(messages_within(readable, nanoseconds(TRIAL_S)))
-        feed = Feed(messages, result.config)
+        feed = Feed(messages, result)
         received = list(feed)
-    sentences(result.lines())
+    sentences(draft.lines())
     for name, text in first_contents(messages).items():
         say(f"first of {name}: {text}")
-    for line in counted_lines(received, result.config):
+    for line in counted_lines(received, result):
         say(f"first {TRIAL_S:g} s of {line}")
-    for item in input_checks(messages, result.config) if messages else ():
+    for item in input_checks(messages, result) if messages else ():
         warn(str(item))
-    return feed.broken if readable.error is None else str(readable.error)
+    problem = feed.broken if readable.error is None else str(readable.error)
+    return problem or draft.problem
+
+
+def _head(draft: Draft) -> list[str]:
+    """Return the first comment lines of a written configuration."""
+    recording = draft.source.path
+    return [
+        f"Settings of {recording.name} (fgtrack info --write): names, values and tests decide what the numbers mean.",
+        "Check units, frames and noise, then run",
+        f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
+    ]
+
+
+def _drafted_input(recording: Path) -> InputConfig | None:
+    """Return the mapping of a recording without a configuration; None for a recording that needs none."""
+    if input_kind(recording) != "csv":
+        return None
+    return opened(recording).config.input
 
 
 def _topics(found: InputInfo, unused: str) -> Table:
@@ -265,12 +275,11 @@ def offsets(
     Reports sensors whose offset is not identifiable.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
-    source = open_recording(recording, config.input)
     with progress("offsets"):
-        result = assumed(config, source)
-        readable = UntilBreak(source.messages())
-        report = estimate_offsets(list(readable), result.config, reference)
-    for line in result.lines() if not as_json else ():
+        draft = drafted(recording, config)
+        readable = UntilBreak(draft.source.messages())
+        report = estimate_offsets(list(readable), draft.config, reference)
+    for line in draft.lines() if not as_json else ():
         say(line)
     verdicts = {item.sensor: clock_text(item, report) for item in report.others}
     show(

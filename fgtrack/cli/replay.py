@@ -26,8 +26,7 @@ from fgtrack.evaluation.diagnostics import (
     noise_diagnostics,
     unused,
 )
-from fgtrack.meaning.assumed import assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.runs import load_run
 
@@ -65,31 +64,30 @@ def replay(
     )
     for folder in folders.values():
         check_no_overlap(folder, [recording, config_file])
-    source = open_recording(recording, config.input)
     with progress("replay") as tell:
-        result = assumed(config, source)
+        draft = drafted(recording, config)
         pipeline.replay(
-            source.messages,
-            result.config,
+            draft.source.messages,
+            draft.config,
             folders,
             origin=str(recording),
-            kind=source.kind,
+            kind=draft.source.kind,
             on_tick=lambda report: tell(
                 f"tick {report.tick}, {len(report.tracks)} tracks"
             ),
             overwrite=overwrite,
         )
     for line in dict.fromkeys(
-        str(replace(result.config, estimator=name).effective) for name in names
+        str(replace(draft.config, estimator=name).effective) for name in names
     ):
         say(line)
     if (
         config_file is None
-        and (suited := suited_reports(result.config.sensors)) is not None
+        and (suited := suited_reports(draft.config.sensors)) is not None
     ):
         warn(suited)
     runs = [load_run(folder) for folder in folders.values()]
-    for line in result.lines():
+    for line in draft.lines():
         say(line)
     for run in runs:
         summary = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
@@ -110,5 +108,5 @@ def replay(
     if (broken := runs[0].meta["broken_off"]) is not None:
         problem = pipeline.with_origin(broken, str(recording))
         raise DataError(f"{problem}; the messages before are replayed")
-    if (reason := unused(runs[0])) is not None:
+    if (reason := unused(runs[0]) or draft.problem) is not None:
         raise DataError(f"{recording}: {reason}")

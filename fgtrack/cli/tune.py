@@ -23,7 +23,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_no_overlap, check_output, write_file
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.meaning.assumption import Assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened_together
 from fgtrack.noise.parameters import HeldOut, TunedParameter, TuneReport, TuneRules
 from fgtrack.noise.tune import tune_sources
 
@@ -62,7 +62,7 @@ def tune(
     check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     check_no_overlap(out, [*recordings, config_file])
-    sources = {str(path): open_recording(path, config.input) for path in recordings}
+    sources, config = opened_together(recordings, config)
     with progress("tune") as tell:
         report = tune_sources(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     shown = {"parameters": _parameters(report.parameters)}

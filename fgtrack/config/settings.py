@@ -399,7 +399,10 @@ class Config:
     estimator: str = "ekf-replay"
     """Name of the estimator for all tracks."""
     sensors: Mapping[str, SensorModel] = field(default_factory=dict)
-    """Sensors by name; if empty, a replay uses the sensors of the recording, with `ASSUMED_STD`."""
+    """Sensors by name. A replay assumes the sensors, and the settings of a sensor, that are not given.
+
+    A configuration is complete, and nothing is assumed, if each sensor has `std` and limits of view.
+    """
     ignore_sensors: tuple[str, ...] = ()
     """Sensors of the input that are ignored, even if `sensors` contains them."""
     input: InputConfig = field(default_factory=InputConfig)
@@ -428,15 +431,6 @@ class Config:
             if ESTIMATORS.resolve(name) != name:
                 raise ValueError(
                     f"options: the estimator {name!r} is now named {ESTIMATORS.resolve(name)!r}"
-                )
-        for key, named in (
-            ("detections", self.input.detections),
-            ("csv.detections", self.input.csv.detections),
-        ):
-            unknown = set(named) - set(self.sensors) - set(self.ignore_sensors)
-            if unknown and self.sensors:
-                raise ValueError(
-                    f"input.{key}: {sorted(unknown)[0]!r} has no model under sensors"
                 )
         if self.motion.kind != "ctrv_euler" and {
             "noise_per_step",

@@ -1,7 +1,7 @@
 """Assumes settings that the configuration leaves open, from the contents and the detections of a recording."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +14,13 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.inputs.source import InputSource
-from fgtrack.meaning.assumption import Assumed, Assumption
+from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
 from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.lives.existence import ExistenceRules
 
-__all__ = ["ASSUMED_STD", "assumed", "is_open", "source_of"]
+__all__ = ["ASSUMED_STD", "assumed", "is_open", "source_of", "unmodelled_sensors"]
 
 #: Standard deviations of a sensor without settings: a LiDAR or RADAR detector of cars.
 ASSUMED_STD = {
@@ -78,12 +78,13 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     carried = recorded(source)
     result = Assumed(config).assuming(*_recorded(config, carried))
     if is_open(result.config):
-        mounts = {
-            name: item.mount
-            for name, item in (result.config.sensors or carried.sensors).items()
-            if item.mount
+        known = {
+            **{name: item.mount for name, item in carried.sensors.items()},
+            **{name: item.mount for name, item in result.config.sensors.items()},
         }
+        mounts = {name: mount for name, mount in known.items() if mount is not None}
         covered = _covered(source, config, mounts)
+        unmodelled = unmodelled_sensors(config, covered)
         rules: list[Rule] = [
             _slow_revisits,
             _noise,
@@ -91,13 +92,17 @@ def assumed(config: Config, source: InputSource) -> Assumed:
             lambda config, _: _recorded(config, carried),
         ]
         rules += [_claim, _offsets, _unplaced, _windows]
-        if config.sensors:
+        if not unmodelled:
             rules = []
             covered = {
                 name: replace(item, persistence=None) for name, item in covered.items()
             }
+        given = departures(config)
         for rule in (*rules, _views, _out_of_view):
-            result = result.assuming(*rule(result.config, covered))
+            new = rule(result.config, covered)
+            result = result.assuming(
+                *(each for each in new if _is_free(each.path, given, unmodelled))
+            )
     config = result.config
     sensors = {
         name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
@@ -110,15 +115,41 @@ def assumed(config: Config, source: InputSource) -> Assumed:
 
 
 def is_open(config: Config) -> bool:
-    """True if `config` has no sensors, or a sensor without a field of view: then `assumed` reads the messages."""
+    """True if `assumed` reads the messages: no sensors are given, or a sensor lacks noise or limits of view."""
     return not config.sensors or not all(
-        sensor.has_view_limits for sensor in config.used_sensors.values()
+        sensor.std and sensor.has_view_limits for sensor in config.used_sensors.values()
     )
 
 
 def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
     """Input source of messages in memory."""
     return InputSource(Path(), "messages", lambda: iter(messages()))
+
+
+def unmodelled_sensors(config: Config, names: Iterable[str]) -> frozenset[str]:
+    """Return the sensors in `names` whose noise `config` leaves open."""
+    return frozenset(
+        name
+        for name in names
+        if name not in config.sensors or not config.sensors[name].std
+    )
+
+
+def _is_free(
+    path: tuple[str, ...], given: Mapping[str, object], unmodelled: Set[str]
+) -> bool:
+    """True if the user has not given the setting at `path`.
+
+    Of a sensor with given noise, only the mount and the limits of view are assumed.
+    """
+    if is_given(given, path) and path != ("ignore_sensors",):
+        return False
+    return (
+        path[0] != "sensors"
+        or path[1] in unmodelled
+        or path[2] in ("mount", "field_of_view_rad", "view_range_m", "max_range_m")
+        or path[2] == "max_range_behind_m"
+    )
 
 
 def _covered(

@@ -13,7 +13,7 @@ from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.errors import printable
 
-__all__ = ["Assumed", "Assumption", "departures"]
+__all__ = ["Assumed", "Assumption", "departures", "is_given"]
 
 
 def _mounted(value: Mapping[str, float]) -> str:
@@ -153,6 +153,15 @@ def departures(value: object) -> Any:  # Any: plain values
         for name, item in given.items()
         if name == "kind" or item != defaults[name]
     }
+
+
+def is_given(given: object, path: Sequence[str]) -> bool:
+    """True if `given`, the `departures` of the user's configuration, contains the key path."""
+    for name in path:
+        if not isinstance(given, Mapping) or name not in given:
+            return False
+        given = given[name]
+    return True
 
 
 def _commented(value: Any) -> Any:  # Any: plain values

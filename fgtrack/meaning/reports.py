@@ -1,21 +1,19 @@
-"""Opens recordings, including tables of position reports that need no mapping of their columns."""
+"""Mapping of tables of position reports, such as AIS and ADS-B, from the names of their columns."""
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError
 from fgtrack.inputs.formats.tables import headers, rows
 from fgtrack.inputs.geodetic import GEODETIC
-from fgtrack.inputs.settings import CsvInput, CsvTable, FieldPath, InputConfig
-from fgtrack.inputs.source import InputSource, input_kind, open_input
+from fgtrack.inputs.settings import CsvInput, CsvTable, FieldPath
+from fgtrack.inputs.source import input_kind
 from fgtrack.meaning.guess import guesses, time_unit, words_of
 from fgtrack.models.sensors import Filter
 
-__all__ = ["open_recording", "reports"]
+__all__ = ["reports"]
 
 #: Number of rows on which the guess of the columns is based.
 _SAMPLES = 200
@@ -24,23 +22,13 @@ _IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
 _HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 
 
-def open_recording(path: Path | str, config: InputConfig | None = None) -> InputSource:
-    """Open the input at `path` as `open_input` does; a table of position reports needs no mapping in `config`.
-
-    Raises as `open_input`. Raises `CallError` if there are several tables of reports.
-    """
-    check_paths(recording=path)
-    config = config or InputConfig()
-    tables = reports(Path(path)) if config.csv == CsvInput() else None
-    return open_input(path, config if tables is None else replace(config, csv=tables))
-
-
 def reports(path: Path) -> CsvInput | None:
     """Return a guessed mapping of the table of position reports at `path`; None if there is no such table.
 
     Times, positions in the map (latitude and longitude, or east and north) and
     identities are read. The sensor is named `adsb` or `ais` after the column of
-    identities, else `reports`. Raises as `open_recording`.
+    identities, else `reports`. Raises `CallError` if there are
+    several such tables.
     """
     if not path.exists() or input_kind(path) != "csv":
         return None

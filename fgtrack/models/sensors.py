@@ -107,8 +107,11 @@ class SensorModel:
     Position errors have one standard deviation along and one across the line of sight.
     """
 
-    std: Mapping[str, PositiveFloat]
-    """Standard deviation of each measured component. The keys are the components that the sensor measures."""
+    std: Mapping[str, PositiveFloat] = field(default_factory=dict)
+    """Standard deviation of each measured component. The keys are the components that the sensor measures.
+
+    Empty: a replay assumes it from the recording. A live tracker needs it.
+    """
     yaw_from_map_std_rad: PositiveFloat | None = None
     """For a sensor without yaw: use the map heading as a yaw measurement with this standard deviation."""
     curvature_from_map_std_radpm: PositiveFloat | None = None
@@ -235,10 +238,8 @@ class SensorModel:
                 raise ValueError(
                     f"{key}: unknown {unknown[0]!r}, use {', '.join(known)}"
                 )
-        if not self.std or ("x_m" in self.std) != ("y_m" in self.std):
-            raise ValueError(
-                "std: give at least one measured component, and x_m and y_m together"
-            )
+        if ("x_m" in self.std) != ("y_m" in self.std):
+            raise ValueError("std: give x_m and y_m together")
 
     @property
     def components(self) -> tuple[str, ...]:

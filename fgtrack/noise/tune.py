@@ -15,7 +15,7 @@ from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.source import InputSource
 from fgtrack.meaning.assumed import assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened_together
 from fgtrack.noise.likelihood.contaminated import outlier_share
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
 from fgtrack.noise.likelihood.reference import filtered, with_mixed_marked
@@ -77,14 +77,11 @@ def tune(
     cannot be read, a sensor has no model, or nothing can be fitted.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
-    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_recording reports an invalid path
+    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # `opened` reports an invalid path
     if isinstance(recordings, Sequence) and not isinstance(recordings, str):
         paths = recordings
-    return tune_sources(
-        {str(path): open_recording(path, resolved.input) for path in paths},
-        resolved,
-        TuneRules(keep=tuple(keep)),
-    )
+    sources, resolved = opened_together(paths, resolved)
+    return tune_sources(sources, resolved, TuneRules(keep=tuple(keep)))
 
 
 def tune_sources(

@@ -54,6 +54,11 @@ def build_tracker(
     config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None
 ) -> Tracker:
     """Return the tracker that `config` describes; `observed` may replace its parts."""
+    for name, sensor in config.used_sensors.items():
+        if not sensor.std:
+            raise CallError(
+                f"sensors.{name}.std: is not set: give the standard deviation of each measured component"
+            )
     road = build_road(config.map, config.defects)
     motion = config.motion_model()
     lifecycle = build_lifecycle(config)

@@ -14,8 +14,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.inputs.recording import Storage, check_recording, write_recording
 from fgtrack.inputs.validation import InvalidMessageError, validated_message
-from fgtrack.meaning.assumed import assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.runs import Run, load_run
 from fgtrack.sim.scenario import Scenario
@@ -64,11 +63,13 @@ def replay(
     origin = ""
     kind = "messages"
     if isinstance(recording, (str, Path)):
-        source = open_recording(recording, resolved.input)
-        resolved = assumed(resolved, source).config
-        messages: Iterable[Message] = source.messages()
+        draft = drafted(recording, resolved)
+        resolved = draft.config
+        messages: Iterable[Message] = draft.source.messages()
         origin = str(recording)
-        kind = source.kind
+        kind = draft.source.kind
+        if draft.problem is not None:
+            warnings.warn(draft.problem, stacklevel=2)
     else:
         messages = _messages(recording)
     if out is None:

@@ -25,7 +25,7 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.output import check_output, locked_folder, write_file
 from fgtrack.core.types import Message
 from fgtrack.meaning.assumed import assumed
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
 from fgtrack.runs import Run
@@ -234,7 +234,8 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         if recipe["recording"] is None:
             messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
         else:
-            source = open_recording(recipe["recording"], config.input)
+            draft = opened(recipe["recording"], config)
+            source = draft.source
             delays = validate(dict[str, SensorDelays], recipe["delays"], "delays")
             messages = list(
                 redelay(source.messages(), delays, rng)[0]
@@ -242,7 +243,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
                 else source.messages()
             )
             config = assumed(
-                config, replace(source, messages=lambda: iter(messages))
+                draft.config, replace(source, messages=lambda: iter(messages))
             ).config
     except (Exception, SystemExit) as error:  # one failed job must not end the sweep
         return key, [

@@ -27,7 +27,7 @@ from fgtrack.config.yaml_file import (
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.inputs.settings import InputConfig
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import versions
 from fgtrack.sim.new_delays import SensorDelays
 from fgtrack.sim.scenario import Scenario
@@ -307,7 +307,7 @@ class _Recorded:
         return known
 
     def _read(self, config: InputConfig) -> tuple[str, Mapping[str, object]]:
-        source = open_recording(self.path, config)
+        source = opened(self.path, Config(input=config)).source
         settings = source.settings()
         result = hashlib.sha256(repr(settings).encode())
         for message in source.messages():

@@ -17,7 +17,7 @@ from fgtrack.inputs.ros.bag_writer import write_bag
 from fgtrack.inputs.settings import Field
 from fgtrack.inputs.source import open_input
 from fgtrack.inputs.stream import write_stream
-from fgtrack.meaning.starting_config import starting_config
+from fgtrack.meaning.draft import drafted
 
 RADAR = """std_msgs/Header header
 Target[] targets
@@ -34,6 +34,10 @@ uint32 id
 def loaded(text, folder):
     (folder / "my.yaml").write_text(text)
     return read_config(folder / "my.yaml")
+
+
+def draft_text(recording):
+    return drafted(recording).to_yaml()
 
 
 def table(path, *rows):
@@ -126,7 +130,7 @@ def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):
             writer.write(
                 words, receipt_ns, store.serialize_cdr(word, "std_msgs/msg/String")
             )
-    text = starting_config(tmp_path / "bag")
+    text = draft_text(tmp_path / "bag")
     config = loaded(text, tmp_path)
     assert dict(config.input.detections["front_radar_scan"].fields) == {
         "objects": "targets",
@@ -143,10 +147,10 @@ def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):
 
 def test_topics_of_known_types_are_the_ego_and_sensors(tmp_path):
     write_bag(tmp_path / "all", drive())
-    own = loaded(starting_config(tmp_path / "all"), tmp_path)
+    own = loaded(draft_text(tmp_path / "all"), tmp_path)
     assert own.input.ego is None
     assert sorted(own.sensors) == ["lidar", "radar"]
-    nav = starting_config(shared("data/bags/nav2_turtlebot.mcap"))
+    nav = draft_text(shared("data/bags/nav2_turtlebot.mcap"))
     config = loaded(nav, tmp_path)
     assert (config.input.ego.topic, config.input.ego.stamp_from) == ("/odom", "receipt")
     assert (
@@ -159,9 +163,9 @@ def test_a_recording_of_which_nothing_can_be_guessed_still_gives_a_configuration
     tmp_path,
 ):
     table(tmp_path / "a.csv", ["alpha\u2028", "beta: 1"], [1, "#x"], [2, "{y"])
-    text = starting_config(tmp_path / "a.csv")
+    text = draft_text(tmp_path / "a.csv")
     assert dict(loaded(text, tmp_path).sensors) == {}
     assert "# Not used: a.csv: no column of times among " in text
     stream = [TruthState(START_NS, START_NS, 1, 0.0, 0.0)]
     write_stream(tmp_path / "s.jsonl", stream)
-    assert dict(loaded(starting_config(tmp_path / "s.jsonl"), tmp_path).sensors) == {}
+    assert dict(loaded(draft_text(tmp_path / "s.jsonl"), tmp_path).sensors) == {}

@@ -182,11 +182,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
             "sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n",
             "std: unknown 'mass_kg'",
         ),
-        ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std: Field required"),
-        (
-            "sensors: {radar: {std: {range_m: 1.0}}}\ninput: {detections: {sonar: {topic: /sonar}}}\n",
-            "input.detections: 'sonar' has no model",
-        ),
+        ("sensors: {lidar: {std: {x_m: 1.0}}}\n", "std: give x_m and y_m together"),
         (
             "filter: {frequency_hz: fast}\n",
             'filter.frequency_hz: Input should be a valid number, not "fast"',

@@ -15,7 +15,7 @@ from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.formats.common import object_id
 from fgtrack.inputs.settings import CsvInput, CsvTable, Field, Filter, InputConfig
 from fgtrack.inputs.source import input_kind, open_input
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import replay_in_memory
 
 EGO = CsvTable(
@@ -346,7 +346,7 @@ def test_position_reports_need_no_mapping(tmp_path, name, sensor, delay_s):
     text = REPORTS[name].encode()
     (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
     for path in (tmp_path, tmp_path / name):
-        last = list(open_recording(path).messages())[-1]
+        last = list(opened(path).source.messages())[-1]
         assert isinstance(last, DetectionList)
         assert (last.sensor, last.frame) == (sensor, "map")
         assert (last.receipt_ns - last.stamp_ns) / 1e9 == delay_s
@@ -357,7 +357,7 @@ def test_several_tables_of_reports_are_not_one_recording(tmp_path):
     for name in ("flights.csv", "ships.csv"):
         (tmp_path / name).write_text(REPORTS[name])
     with pytest.raises(CallError, match="contains 2 tables of reports: give one"):
-        open_recording(tmp_path)
+        opened(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -370,14 +370,14 @@ def test_several_tables_of_reports_are_not_one_recording(tmp_path):
 )
 def test_times_may_be_dates(tmp_path, text, time_ns):
     (tmp_path / "a.csv").write_text(f"time,lat,lon\n{text},41.3,2.08\n")
-    assert next(open_recording(tmp_path).messages()).stamp_ns == time_ns
+    assert next(opened(tmp_path).source.messages()).stamp_ns == time_ns
 
 
 def test_rows_that_repeat_a_position_are_left_out_and_unnamed_columns_ignored(tmp_path):
     (tmp_path / "a.csv").write_text(
         "time,lat,lon,hex,no_position,,\n1,41.3,2.08,0x4ca911,P,x,y\n2,41.3,2.08,0x4ca911,N,x,y\n"
     )
-    (one,) = open_recording(tmp_path).messages()
+    (one,) = opened(tmp_path).source.messages()
     assert one.objects[0].id == "4CA911"
     assert one.left_out == ("filters.no_position",)
 
@@ -387,7 +387,7 @@ def test_one_wrong_clock_among_many_does_not_make_a_table_years_long(tmp_path):
     (tmp_path / "a.csv").write_text(
         f"time,lat,lon\n1970-01-01 00:00:00,41.3,2.08\n{rows}"
     )
-    assert len(list(open_recording(tmp_path).messages())) == 121
+    assert len(list(opened(tmp_path).source.messages())) == 121
 
 
 def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path):

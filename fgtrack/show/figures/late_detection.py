@@ -14,7 +14,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FUSED, DetectionList, Disposition
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.meaning.reports import open_recording
+from fgtrack.meaning.draft import opened
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.replay import delivered
@@ -87,7 +87,7 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
     try:
         config = validate(Config, run.config, str(run.config_path))
         tracker = build_tracker(config)
-        messages = open_recording(run.recording, config.input).messages()
+        messages = opened(run.recording, config).source.messages()
     except CallError as error:  # the path comes from the run, not from the caller
         raise DataError(f"{error}, so there is no close-up") from error
     key = arrival.sensor, arrival.receipt_ns, arrival.index
