@@ -22,7 +22,7 @@ from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.evidence import decided
 from fgtrack.meaning.guess import words_of
 from fgtrack.meaning.parts import EGO_WORDS, InputPart
-from fgtrack.meaning.reports import reports
+from fgtrack.meaning.reports import report_part
 from fgtrack.meaning.tables import table_part
 from fgtrack.meaning.topics import topic_part
 
@@ -85,7 +85,7 @@ class Draft:
         return f"{left_out}open: {questions}"
 
     def lines(self) -> list[str]:
-        """Return what was found out, a line each: open questions, tested decisions, assumptions, unused parts."""
+        """Return the result in lines: open questions, tested decisions, assumptions, unused parts."""
         ranked = sorted(
             self.decisions, key=lambda item: _CERTAINTIES.index(item.certainty)
         )
@@ -226,12 +226,8 @@ def _unreadable(path: Path, kind: str, unused: Sequence[str]) -> InputSource:
 
 def _mapped(path: Path, kind: str) -> tuple[list[InputPart], tuple[str, ...]]:
     """Return the parts of the recording that can be read, one for each role, and a line for each other part."""
-    if kind == "csv" and len(headers(path)) == 1:
-        tables = reports(path)
-        if tables is not None:
-            return [
-                InputPart(name, table, {}) for name, table in tables.detections.items()
-            ], ()
+    if kind == "csv" and (part := report_part(path)) is not None:
+        return [part], ()
     parts, unused = _parts(path, kind)
     taken = _readable(path, parts, unused)
     return taken, tuple(unused)

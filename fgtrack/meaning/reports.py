@@ -1,19 +1,18 @@
-"""Mapping of tables of position reports, such as AIS and ADS-B, from the names of their columns."""
+"""Mapping of a table of position reports, such as AIS and ADS-B, from the names of its columns."""
 
 from collections.abc import Iterable
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
-from fgtrack.core.errors import CallError
 from fgtrack.inputs.formats.tables import headers, rows
 from fgtrack.inputs.geodetic import GEODETIC
-from fgtrack.inputs.settings import CsvInput, CsvTable, FieldPath
-from fgtrack.inputs.source import input_kind
+from fgtrack.inputs.settings import CsvTable, FieldPath
 from fgtrack.meaning.guess import guesses, time_unit, words_of
+from fgtrack.meaning.parts import InputPart
 from fgtrack.models.sensors import Filter
 
-__all__ = ["reports"]
+__all__ = ["report_part"]
 
 #: Number of rows on which the guess of the columns is based.
 _SAMPLES = 200
@@ -22,56 +21,43 @@ _IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
 _HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 
 
-def reports(path: Path) -> CsvInput | None:
-    """Return a guessed mapping of the table of position reports at `path`; None if there is no such table.
+def report_part(path: Path) -> InputPart | None:
+    """Return a guessed mapping of the only table at `path`; None if it is not a table of position reports.
 
     Times, positions in the map (latitude and longitude, or east and north) and
     identities are read. The sensor is named `adsb` or `ais` after the column of
-    identities, else `reports`. Raises `CallError` if there are
-    several such tables.
+    identities, else `reports`. Raises `DataError` for a table that cannot be read.
     """
-    if not path.exists() or input_kind(path) != "csv":
+    tables = headers(path)
+    if len(tables) != 1:
         return None
-    tables = list[tuple[Path, str, CsvTable]]()
-    is_folder = path.is_dir()
-    for file, names in headers(path).items():
-        cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
-        guessed = guesses(
-            {name: _numbers(each[name] for each in cells) for name in names if name}
-        )
-        known = ("stamp", "receipt", *GEODETIC, "id")
-        columns: dict[str, FieldPath] = {
-            key: guessed[key].path for key in known if key in guessed
-        }
-        if not {*GEODETIC} <= columns.keys():
-            columns |= {
-                key: guessed[key].path for key in ("x_m", "y_m") if key in guessed
-            }
-            if not all(
-                set(words_of(str(columns.get(key, "")))) & _IN_MAP
-                for key in ("x_m", "y_m")
-            ):
-                continue
-        if "stamp" not in columns:
-            continue
-        unit, _ = time_unit(
-            str(columns["stamp"]),
-            _numbers(each[str(columns["stamp"])] for each in cells),
-        )
-        words = set(words_of(str(columns.get("id", ""))))
-        sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
-        filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
-        name = file.name if is_folder else None
-        table = CsvTable(columns, name, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT
-        tables.append((file, sensor, table))
-    if len(tables) > 1:
-        raise CallError(
-            f"{path}: contains {len(tables)} tables of reports: give one of them, for example {tables[0][0]}, "
-            "or set input.csv"
-        )
-    if not tables:
+    [(file, names)] = tables.items()
+    cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
+    guessed = guesses(
+        {name: _numbers(each[name] for each in cells) for name in names if name}
+    )
+    known = ("stamp", "receipt", *GEODETIC, "id")
+    columns: dict[str, FieldPath] = {
+        key: guessed[key].path for key in known if key in guessed
+    }
+    if not {*GEODETIC} <= columns.keys():
+        columns |= {key: guessed[key].path for key in ("x_m", "y_m") if key in guessed}
+        if not all(
+            set(words_of(str(columns.get(key, "")))) & _IN_MAP for key in ("x_m", "y_m")
+        ):
+            return None
+    if "stamp" not in columns:
         return None
-    return CsvInput(detections={sensor: table for _, sensor, table in tables})
+    unit, _ = time_unit(
+        str(columns["stamp"]), _numbers(each[str(columns["stamp"])] for each in cells)
+    )
+    words = set(words_of(str(columns.get("id", ""))))
+    sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
+    filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
+    name = file.name if path.is_dir() else None
+    table = CsvTable(columns, name, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT
+    reasons = {key: guessed[key].reason for key in columns}
+    return InputPart(sensor, table, reasons)
 
 
 def _numbers(texts: Iterable[str]) -> list[float]:

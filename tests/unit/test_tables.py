@@ -353,11 +353,14 @@ def test_position_reports_need_no_mapping(tmp_path, name, sensor, delay_s):
         assert last.objects[0].y_m == pytest.approx(1110.7, abs=0.5)
 
 
-def test_several_tables_of_reports_are_not_one_recording(tmp_path):
+def test_several_tables_of_reports_are_several_sensors(tmp_path):
     for name in ("flights.csv", "ships.csv"):
         (tmp_path / name).write_text(REPORTS[name])
-    with pytest.raises(CallError, match="contains 2 tables of reports: give one"):
-        opened(tmp_path)
+    messages = list(opened(tmp_path).source.messages())
+    assert {(each.sensor, each.frame) for each in messages} == {
+        ("flights", "map"),
+        ("ships", "map"),
+    }
 
 
 @pytest.mark.parametrize(
