@@ -9,6 +9,7 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import (
+    BoolArray,
     DetectionList,
     Disposition,
     EgoState,
@@ -25,7 +26,13 @@ from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego.trajectory import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.facing import Facings
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
-from fgtrack.tracking.lives.counters import CountingLifecycle, Life, Scan
+from fgtrack.tracking.lives.counters import (
+    COUNTER,
+    LAST_SEEN,
+    MISSES,
+    CountingLifecycle,
+    Scan,
+)
 from fgtrack.tracking.lives.latency import FOREVER
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
@@ -295,20 +302,21 @@ class PublishedLifecycle(CountingLifecycle):
         states: StatesAt,
     ) -> None:
         """See `CountingLifecycle.matched`."""
-        for _, track in pairs:
-            life = self.lives[states.track_ids[track]]
-            if life.counter < self._rules.counter_cap:
-                life.counter += self._sensors[scan.sensor].counter_add
-            life.last_seen_ns = scan.stamp_ns
-            life.misses = 0
+        for row in self._rows.of([states.track_ids[track] for _, track in pairs]):
+            counters = self._counters[row]
+            if counters[COUNTER] < self._rules.counter_cap:
+                counters[COUNTER] += self._sensors[scan.sensor].counter_add
+            counters[LAST_SEEN], counters[MISSES] = scan.stamp_ns, 0
 
-    def _ages(self, sensor: str, range_m: float) -> bool:
-        return self._sensors[sensor].ages != "always" and super()._ages(sensor, range_m)
+    def _ages(self, sensor: str, ranges_m: FloatArray) -> BoolArray:
+        if self._sensors[sensor].ages == "always":
+            return np.zeros(len(ranges_m), dtype=bool)
+        return super()._ages(sensor, ranges_m)
 
-    def _ends(self, life: Life, scan: Scan) -> bool:
-        return (
-            life.counter <= 0 or scan.present_ns - life.last_seen_ns > self._forget_ns
-        )
+    def _ends(self, rows: IntArray, scan: Scan) -> BoolArray:
+        counters = self._counters[rows]
+        is_old = scan.present_ns - counters[:, LAST_SEEN] > self._forget_ns
+        return np.asarray((counters[:, COUNTER] <= 0) | is_old)
 
     def expired(
         self,

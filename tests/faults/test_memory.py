@@ -28,7 +28,9 @@ GROWING = (
     "fgtrack.tracking.lives.existence",
     "fgtrack.tracking.guarded_bank",
     "fgtrack.tracking.tracker",
+    "fgtrack.tracking.lives.counters",
     "fgtrack.tracking.lives.visibility",
+    "fgtrack.tracking.rows",
 )
 ALLOCATING = ("array", "concatenate", "empty", "full", "tile", "vstack", "zeros")
 NUM_OBJECTS = 11

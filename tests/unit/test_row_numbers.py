@@ -22,6 +22,7 @@ MODULES = (
     "fgtrack.estimation.smoothing.node_kernels",
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
+    "fgtrack.tracking.lives.counter_kernels",
     "fgtrack.tracking.lives.visibility_kernels",
 )
 #: Names of arguments that are row numbers, or indices of what a row has.

@@ -1,22 +1,30 @@
 """Life of a track: the status counter of Karle et al. 2023, section III-D."""
 
-from bisect import insort
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import compress
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
+from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import settings
 from fgtrack.core.state import Stateful
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Detection, FloatArray, IntArray, TrackStatus
+from fgtrack.core.types import (
+    BoolArray,
+    Detection,
+    FloatArray,
+    IntArray,
+    TrackStatus,
+)
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego.trajectory import EgoPose
-from fgtrack.tracking.lives.latency import FOREVER, NEVER, Views, decided_ns
+from fgtrack.tracking.lives.latency import FOREVER, NEVER, Views
 from fgtrack.tracking.preprocess import Candidate, Candidates
+from fgtrack.tracking.rows import FEWEST, TrackRows
 
 
 class Scan(NamedTuple):
@@ -31,34 +39,37 @@ class Scan(NamedTuple):
     """All detections of the message."""
 
 
-_MANY_CHANGES = (
-    16  # of a counter, from which on those that no late list can precede are settled
-)
+#: Columns of the counters of a track:
+#: - counter after all matches and misses so far, in order of their stamps; it stays where it has reached 0
+#: - newest stamp of a match
+#: - measurements of the position that have changed the state, the first one included
+#: - misses since the last match
+#: - counter after the matches and misses that no late list can precede, and the number of the others
+#: - stamp at which the counter has reached 0
+#: - newest stamp for which it is known which sensors could show the object
+COUNTER, LAST_SEEN, NUM_PLACED, MISSES, SETTLED, NUM_CHANGES, ENDS, JUDGED = range(8)
+NUM_COLUMNS = 8
+#: Changes from which on those that no late list can precede are settled.
+MANY_CHANGES = 16
+_FEWEST_CHANGES = 32
+_KERNELS = "fgtrack.tracking.lives.counter_kernels"
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Life:
     """Counters of one track."""
 
     counter: int
-    """After all matches and misses so far, in order of their stamps; it stays where it has reached 0."""
+    """After all matches and misses so far, in order of their stamps."""
     last_seen_ns: int
-    num_placed: int = 1
+    num_placed: int
     """Measurements of its position that have changed its state, the first one included."""
-    misses: int = 0
+    misses: int
     """Misses since the last match."""
-    settled: int = 0
+    settled: int
     """Counter after the matches and misses that no late list can precede."""
-    changes: list[tuple[int, int]] = field(default_factory=list)
-    """The others, ascending: stamp, and decrement of the counter. At one stamp matches precede misses."""
-    ends_ns: int = FOREVER
-    """Stamp at which the counter reached 0."""
-    judged_ns: int = NEVER
-    """Newest stamp for which it is known which sensors could show it."""
-    could_show: list[bool] = field(default_factory=list)
-    """By sensor: true if the sensor could show it then."""
-    expected_ns: list[int] = field(default_factory=list)
-    """By sensor: newest stamp at which the sensor could show it."""
+    num_changes: int
+    """Number of the other matches and misses."""
 
 
 @settings
@@ -93,7 +104,11 @@ class CountingLifecycle(Stateful):
 
     STATE: ClassVar[tuple[str, ...]] = (
         "_watermarks_ns",
-        "lives",
+        "_rows",
+        "_counters",
+        "_changes",
+        "_could_show",
+        "_expected_ns",
     )
 
     birth_probability = 0.5
@@ -113,21 +128,52 @@ class CountingLifecycle(Stateful):
         self._awaits = rules.awaits_late_lists and rules.kind == "counting"
         self._views = Views(sensors, detection_origin_m)
         self._watermarks_ns = np.full(len(sensors), FOREVER)
-        self.lives: dict[int, Life] = {}
-        """Counters by track id."""
+        self._rows = TrackRows()
+        self._counters: IntArray = np.zeros((0, NUM_COLUMNS), dtype=np.int64)
+        """Shape (tracks, columns)."""
+        self._changes: IntArray = np.zeros((0, _FEWEST_CHANGES, 2), dtype=np.int64)
+        """Stamps of matches and misses that are not settled, ascending, and decrements of the counter."""
+        self._could_show: BoolArray = np.zeros((0, len(sensors)), dtype=bool)
+        """True if the sensor could show the object at the newest stamp for which that is known, (tracks, sensors)."""
+        self._expected_ns: IntArray = np.zeros((0, len(sensors)), dtype=np.int64)
+        """Newest stamp at which the sensor could show the object, shape (tracks, sensors)."""
+
+    @property
+    def lives(self) -> dict[int, Life]:
+        """Copies of the counters by track id."""
+        return {
+            track_id: Life(*self._counters[row, :ENDS].tolist())
+            for track_id, row in self._rows.by_id.items()
+        }
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """A detection started a track."""
-        counter = self._sensors[scan.sensor].counter_init
-        self.lives[track_id] = life = Life(counter, scan.stamp_ns, settled=counter)
-        if self._awaits:
-            could_show = self._views.at_birth(
-                candidate.position_m, scan.ego, self._index[scan.sensor]
-            )
-            life.judged_ns, life.could_show = scan.stamp_ns, could_show.tolist()
-            life.expected_ns = [
-                scan.stamp_ns if could else NEVER for could in life.could_show
-            ]
+        if self._rows.following >= len(self._counters):
+            self._allocate(2 * len(self._counters) or FEWEST, self._changes.shape[1])
+        counter, stamp_ns = self._sensors[scan.sensor].counter_init, scan.stamp_ns
+        could_show = self._views.at_birth(
+            candidate.position_m, scan.ego, self._index[scan.sensor]
+        )
+        row = self._rows.begin(track_id)
+        self._counters[row] = counter, stamp_ns, 1, 0, counter, 0, FOREVER, stamp_ns
+        self._could_show[row] = could_show
+        self._expected_ns[row] = np.where(could_show, stamp_ns, NEVER)
+
+    def _allocate(self, num_tracks: int, num_changes: int) -> None:
+        """Make larger arrays with the present contents; all are allocated before one is replaced."""
+        tracks, changes, _ = self._changes.shape
+        counters = np.zeros((num_tracks, NUM_COLUMNS), dtype=np.int64)
+        more = np.zeros((num_tracks, num_changes, 2), dtype=np.int64)
+        could_show = np.zeros((num_tracks, len(self._sensors)), dtype=bool)
+        expected_ns = np.zeros((num_tracks, len(self._sensors)), dtype=np.int64)
+        counters[:tracks], more[:tracks, :changes] = self._counters, self._changes
+        could_show[:tracks], expected_ns[:tracks] = self._could_show, self._expected_ns
+        self._counters, self._changes = counters, more
+        self._could_show, self._expected_ns = could_show, expected_ns
+
+    @property
+    def _arrays(self) -> tuple[IntArray, IntArray, BoolArray, IntArray]:
+        return self._counters, self._changes, self._could_show, self._expected_ns
 
     def matched(
         self,
@@ -137,26 +183,21 @@ class CountingLifecycle(Stateful):
         states: StatesAt,
     ) -> None:
         """Candidates were associated with tracks, which had these `states` at the stamp."""
-        stamp_ns, own = scan.stamp_ns, self._index[scan.sensor]
-        lives = [
-            self.lives[states.track_ids[track]]
-            for position, track in pairs
-            if candidates.placed[position]
-        ]
-        self._change(lives, stamp_ns, self._sensors[scan.sensor].counter_add)
-        for life in lives:
-            life.misses = 0
-            if stamp_ns > life.last_seen_ns:
-                life.last_seen_ns = stamp_ns
-            if self._awaits:
-                life.could_show[own] = True
-                if stamp_ns > life.expected_ns[own]:
-                    life.expected_ns[own] = stamp_ns
+        placed, track_ids = candidates.placed, states.track_ids
+        rows = self._rows.of([track_ids[track] for i, track in pairs if placed[i]])
+        increment = self._sensors[scan.sensor].counter_add
+        match = rows, self._index[scan.sensor], scan.stamp_ns, increment
+        self._count(kernels(_KERNELS).match, *match)
 
-    def fused(self, track_ids: Iterable[int]) -> None:
+    def _count(self, function: Callable[..., bool], *change: object) -> None:
+        """Call a compiled loop that adds one change to tracks, in larger arrays where room is missing."""
+        most, awaits = self._rules.counter_cap, self._awaits
+        while not function(*change, most, awaits, *self._arrays):
+            self._allocate(len(self._counters), 2 * self._changes.shape[1])
+
+    def fused(self, track_ids: Sequence[int]) -> None:
         """The associated detections, which give positions, changed the states."""
-        for track_id in track_ids:
-            self.lives[track_id].num_placed += 1
+        self._counters[self._rows.of(track_ids), NUM_PLACED] += 1
 
     def missed(
         self,
@@ -166,86 +207,27 @@ class CountingLifecycle(Stateful):
         ranges_m: FloatArray,
     ) -> list[int]:
         """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
-        ended = []
-        views = self._views.of(positions_m, scan.ego) if self._awaits else None
-        for row, (track_id, range_m) in enumerate(
-            zip(track_ids, ranges_m.tolist(), strict=True)
-        ):
-            life = self.lives[track_id]
-            if views is not None:
-                self._judge(life, scan, views[row].tolist())
-            if self._ages(scan.sensor, range_m):
-                life.misses += 1
-                self._change([life], scan.stamp_ns, -1)
-            if self._ends(life, scan):
-                ended.append(track_id)
-        return ended
+        rows, ages = self._rows.of(track_ids), self._ages(scan.sensor, ranges_m)
+        views = self._views.of(positions_m, scan.ego)
+        self._count(kernels(_KERNELS).miss, rows, ages, views, scan.stamp_ns)
+        return list(compress(track_ids, self._ends(rows, scan).tolist()))
 
-    def _judge(self, life: Life, scan: Scan, could_show: list[bool]) -> None:
-        """Note which sensors could show the object at the stamp of a list."""
-        for own, could in enumerate(could_show):
-            if could and scan.stamp_ns > life.expected_ns[own]:
-                life.expected_ns[own] = scan.stamp_ns
-        if scan.stamp_ns >= life.judged_ns:
-            life.judged_ns, life.could_show = scan.stamp_ns, could_show
-
-    def _change(self, lives: Iterable[Life], stamp_ns: int, increment: int) -> None:
-        """Change counters at the stamp of a list: by order of arrival, or from there on by order of stamps."""
-        change, awaits = (stamp_ns, -increment), self._awaits
-        most = self._rules.counter_cap
-        for life in lives:
-            if awaits:
-                changes = life.changes
-                if changes and change < changes[-1]:
-                    self._recount(life, change)
-                    continue
-                changes.append(change)
-                if life.ends_ns != FOREVER:
-                    continue
-            counter = life.counter + increment
-            life.counter = most if increment >= 0 and counter > most else counter
-            if awaits and life.counter <= 0:
-                life.ends_ns = stamp_ns
-
-    def _recount(self, life: Life, change: tuple[int, int]) -> None:
-        """Insert a late change, and count again from the changes that no late list can precede."""
-        insort(life.changes, change)
-        life.counter, life.ends_ns = life.settled, FOREVER
-        for stamp_ns, decrement in life.changes:
-            life.counter = self._counted(life.counter, -decrement)
-            if life.counter <= 0:
-                life.ends_ns = stamp_ns
-                return
-
-    def _counted(self, counter: int, increment: int) -> int:
-        return (
-            counter + increment
-            if increment < 0
-            else min(counter + increment, self._rules.counter_cap)
-        )
-
-    def _ages(self, sensor: str, range_m: float) -> bool:
-        """True if `sensor` counts down a track at `range_m` that it has missed."""
+    def _ages(self, sensor: str, ranges_m: FloatArray) -> BoolArray:
+        """True of tracks at `ranges_m` (m,) that `sensor` counts down when it misses them, shape (m,)."""
         ages = self._sensors[sensor].ages
-        near = range_m <= self._rules.short_range_m
-        return ages == "always" or ages == ("short_range" if near else "long_range")
+        if ages in ("always", "never"):
+            return np.full(len(ranges_m), ages == "always")
+        near = ranges_m <= self._rules.short_range_m
+        return np.asarray(near if ages == "short_range" else ~near)
 
-    def _ends(self, life: Life, scan: Scan) -> bool:
-        """True if a track ends at a list that misses it."""
+    def _ends(self, rows: IntArray, scan: Scan) -> BoolArray:
+        """True of the tracks in `rows` that end at a list that misses them, shape (m,)."""
         if not self._awaits:
-            return life.counter <= 0
-        if life.ends_ns == FOREVER:
-            return False
-        [decided] = self._decided_ns([life], scan.stamp_ns)
-        return life.ends_ns <= decided
-
-    def _decided_ns(self, lives: Sequence[Life], processed_ns: int) -> list[int]:
-        """Stamps up to which all lists that could show each object have come and are processed."""
-        watermarks_ns = np.minimum(self._watermarks_ns, processed_ns)
-        could_show = np.array([life.could_show for life in lives])
-        expected_ns = np.array([life.expected_ns for life in lives])
-        decided: list[int] = decided_ns(watermarks_ns, could_show, expected_ns).tolist()
-        return decided
+            return np.asarray(self._counters[rows, COUNTER] <= 0)
+        ended: BoolArray = kernels(_KERNELS).ended(
+            rows, self._watermarks_ns, scan.stamp_ns, *self._arrays
+        )
+        return ended
 
     def expired(
         self,
@@ -258,43 +240,24 @@ class CountingLifecycle(Stateful):
         `watermarks_ns` are those of the sensors, shape (sensors,); None if they are as before. All lists with stamps
         before `processed_ns` that have come are processed.
         """
-        if not self._awaits:
-            return [
-                i
-                for i, life in self.lives.items()
-                if present_ns - life.last_seen_ns > self._forget_ns
-            ]
         if watermarks_ns is not None:
             self._watermarks_ns = watermarks_ns
-        seen_ns = present_ns - self._forget_ns
-        doubtful = {
-            track_id: life
-            for track_id, life in self.lives.items()
-            if life.last_seen_ns < seen_ns
-            or life.ends_ns != FOREVER
-            or len(life.changes) >= _MANY_CHANGES
-        }
-        if not doubtful:
-            return []
-        ended = list[int]()
-        known = self._decided_ns(list(doubtful.values()), processed_ns)
-        for (track_id, life), known_ns in zip(doubtful.items(), known, strict=True):
-            decided = min(known_ns, present_ns)
-            if life.ends_ns <= decided or decided - life.last_seen_ns > self._forget_ns:
-                ended.append(track_id)
-            else:
-                self._settle(life, decided)
-        return ended
-
-    def _settle(self, life: Life, decided_ns: int) -> None:
-        """Count the changes up to a stamp that no late list can precede."""
-        num_settled = 0
-        for stamp_ns, decrement in life.changes:
-            if stamp_ns > decided_ns:
-                break
-            life.settled = self._counted(life.settled, -decrement)
-            num_settled += 1
-        del life.changes[:num_settled]
+        rows = self._rows.every
+        if not self._awaits:
+            ended = present_ns - self._counters[rows, LAST_SEEN] > self._forget_ns
+            return list(compress(self._rows.by_id, ended.tolist()))
+        ended = np.empty(len(rows), dtype=bool)
+        number = kernels(_KERNELS).expire(
+            rows,
+            present_ns,
+            self._forget_ns,
+            self._watermarks_ns,
+            processed_ns,
+            self._rules.counter_cap,
+            *self._arrays,
+            ended,
+        )
+        return list(compress(self._rows.by_id, ended.tolist())) if number else []
 
     def suspended(self, stamp_ns: int | None = None) -> frozenset[int]:
         """The ids of tracks that end unless a list shows them that is still due, at `stamp_ns` or at all.
@@ -304,7 +267,7 @@ class CountingLifecycle(Stateful):
 
     def forget(self, track_id: int) -> None:
         """The track has ended, or could not begin."""
-        self.lives.pop(track_id, None)
+        self._rows.end(track_id)
 
     def existing(self, track_ids: Sequence[int], stamp_ns: int) -> FloatArray:
         """Probabilities that the objects of tracks exist at a stamp, shape (m,); 1 / 2, as counts give none."""
@@ -316,7 +279,7 @@ class CountingLifecycle(Stateful):
 
     def status(self, track_id: int) -> TrackStatus:
         """Status of the track."""
-        life = self.lives[track_id]
-        if life.num_placed < self._rules.confirm_count:
+        counters = self._counters[self._rows.by_id[track_id]]
+        if counters[NUM_PLACED] < self._rules.confirm_count:
             return TrackStatus.TENTATIVE
-        return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
+        return TrackStatus.COASTING if counters[MISSES] else TrackStatus.CONFIRMED
