@@ -5,6 +5,7 @@ import os
 import resource
 import sys
 import traceback
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -15,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 from typer import Option
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import fgtrack
 from fgtrack.cli.exit_codes import BAD_CALL, BAD_DATA, DONE, INTERRUPTED
@@ -52,6 +53,10 @@ _STYLE: dict[str, Any] = {
 class _LazyCommands(TyperGroup):
     """Imports a command's module when the command is called; the help imports no such module."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _check_once(self, ctx, args)
+        return super().parse_args(ctx, args)
+
     def resolve_command(
         self, ctx: Any, args: list[str]
     ) -> tuple[str | None, Any, list[str]]:
@@ -59,9 +64,29 @@ class _LazyCommands(TyperGroup):
         return name, None if name is None else _command(name), rest
 
 
+class _OnceCommand(TyperCommand):
+    """Command that refuses an option that is given twice and takes one value; Click would use the last value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _check_once(self, ctx, args)
+        return super().parse_args(ctx, args)
+
+
+def _check_once(command: Any, ctx: Any, args: list[str]) -> None:
+    """Raise `CallError` if `args` give an option of `command` twice that takes one value."""
+    _, _, order = command.make_parser(ctx).parse_args(args=list(args))
+    for param, count in Counter(order).items():
+        takes_one = param.param_type_name == "option" and not param.multiple
+        if count > 1 and takes_one and not param.is_flag:
+            raise CallError(
+                f"{' / '.join(param.opts)}: given {count} times, but the option takes one value"
+            )
+
+
 def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
     single = typer.Typer(**_STYLE)
-    single.command(name)(getattr(import_module(f"fgtrack.cli.{COMMANDS[name]}"), name))
+    function = getattr(import_module(f"fgtrack.cli.{COMMANDS[name]}"), name)
+    single.command(name, cls=_OnceCommand)(function)
     return typer.main.get_command(single)
 
 

@@ -253,6 +253,14 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
             "usage: fgtrack replay [OPTIONS] {INPUT})",
         ),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
+        (
+            ("replay", "drive.jsonl", "-o", "run", "-c", "a.yaml", "--config", "b"),
+            "-c / --config: given 2 times, but the option takes one value",
+        ),
+        (
+            ("--max-memory", "1", "--max-memory", "2", "info", "drive.jsonl"),
+            "--max-memory: given 2 times",
+        ),
     ],
     ids=" ".join,
 )
