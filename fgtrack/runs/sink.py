@@ -1,7 +1,7 @@
 """Base of the sinks of a run, which collect table rows, counts of the dispositions, and meta data."""
 
 from abc import ABC, abstractmethod
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import astuple
 from time import monotonic
@@ -19,6 +19,8 @@ from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.runs.rows import Row, detection_rows, rows, smoothed_rows, state_cells
 from fgtrack.runs.schema import COLUMNS, RUN_FORMAT
 
+#: Number of the first columns of `detections` that name a detection: sensor, stamp, receipt and index.
+_KEY = 4
 PERIOD_S = 0.2
 """Wall time between two writes of rows. Writing each row by itself would take as long as formatting it."""
 
@@ -50,6 +52,8 @@ class RunSink(ABC):
         self._left_out: dict[str, Counter[str]] = defaultdict(Counter)
         # Newest reports on the objects of tracks that have not ended.
         self._objects: dict[int, ObjectReport] = {}
+        # Rows of detections without a record yet, by sensor, stamp, receipt and index; duplicates share a key.
+        self._waiting: dict[Row, deque[Row]] = defaultdict(deque)
         # Rows that are not appended yet.
         self._rows: dict[str, list[Row]] = {table: [] for table in COLUMNS}
         self._due_s = 0.0
@@ -67,6 +71,9 @@ class RunSink(ABC):
             self._counts[record.sensor][record.disposition] += 1
             if record.reason is not None:
                 self._out_of_bounds[record.sensor][record.reason] += 1
+            self._take(
+                (record.sensor, record.stamp_ns, record.receipt_ns, record.index)
+            )
         self._end_objects({track.track_id for track in report.tracks})
         self._objects |= {
             track.track_id: track.object
@@ -115,8 +122,12 @@ class RunSink(ABC):
         self._rows["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
 
     def write_detections(self, message: DetectionList) -> None:
-        """Add rows to the table `detections`, and count the objects that the reader left out."""
-        self._rows["detections"] += detection_rows(message)
+        """Keep the rows of `message` for the table `detections`, and count the objects that the reader left out.
+
+        The row of a detection follows when its record is written, so both tables have the same order.
+        """
+        for row in detection_rows(message):
+            self._waiting[row[:_KEY]].append(row)
         if message.origin_deg is not None:
             self._meta.setdefault(
                 "origin", dict(zip(GEODETIC, message.origin_deg, strict=True))
@@ -127,6 +138,8 @@ class RunSink(ABC):
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run with `meta`, the counts by sensor and the digest; return the content of `meta.json`."""
         self._end_objects(set())
+        for rows_of_key in self._waiting.values():  # received, but never processed
+            self._rows["detections"] += rows_of_key
         self._append_rows()
         counts = {
             sensor: {
@@ -146,6 +159,13 @@ class RunSink(ABC):
             "digest": self._digest(),
         }
         return dict(self._meta)
+
+    def _take(self, key: Row) -> None:
+        """Move the row of the detection `key`, if it waits, to the table `detections`."""
+        if waiting := self._waiting.get(key):
+            self._rows["detections"].append(waiting.popleft())
+            if not waiting:
+                del self._waiting[key]
 
     def _end_objects(self, alive: Set[int]) -> None:
         """Add rows to the table `objects` for tracks that have ended: those not in `alive`."""

@@ -61,8 +61,8 @@ def test_replays_are_the_same_in_memory_and_written(
     assert memory.tables["ego"].num_rows == sum(
         isinstance(message, EgoState) for message in messages
     )
-    said, ended = (
-        sorted(
+    received, ended = (
+        list(
             zip(
                 *(
                     table[name].tolist()
@@ -73,7 +73,7 @@ def test_replays_are_the_same_in_memory_and_written(
         )
         for table in (memory.tables["detections"], memory.tables["updates"])
     )
-    assert said == ended
+    assert received == ended, "row k of both tables is the same detection"
     assert (
         (memory.tables["lagged"].num_rows > 100)
         == (memory.tables["smoothed"].num_rows > 100)
