@@ -24,6 +24,8 @@ from fgtrack.evaluation.diagnostics import (
     diagnostics,
     excluded_lines,
     noise_diagnostics,
+    received_nothing,
+    repeated,
     unused,
 )
 from fgtrack.meaning.draft import drafted
@@ -94,11 +96,12 @@ def replay(
         say(f"{run.path}: {summary.format_map(run.meta)}")
     for line in excluded_lines(runs[0].meta):  # all runs exclude the same detections
         say(line)
+    loop = repeated(runs[0])
     for line in dict.fromkeys(
         map(
             str,
             [
-                *(item for run in runs for item in diagnostics(run)),
+                *(item for run in runs for item in diagnostics(run) if item != loop),
                 *noise_diagnostics(runs[0]),
             ],
         )
@@ -108,5 +111,8 @@ def replay(
     if (broken := runs[0].meta["broken_off"]) is not None:
         problem = pipeline.with_origin(broken, str(recording))
         raise DataError(f"{problem}; the messages before are replayed")
-    if (reason := unused(runs[0]) or draft.problem) is not None:
+    reason = received_nothing(runs[0]) or unused(runs[0])
+    if reason is None and loop is not None:
+        reason = loop.text
+    if (reason := reason or draft.problem) is not None:
         raise DataError(f"{recording}: {reason}")

@@ -98,11 +98,12 @@ def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | 
     sooner = {
         name: delay_s
         for name, delay_s in delays_s.items()
-        if ego_delay_s - delay_s > _LATE_S
+        if ego_delay_s - max(delay_s, 0.0)
+        > _LATE_S  # a negative delay is an error of the sensor's clock
     }
     if not sooner:
         return None
-    later_ms = 1e3 * (ego_delay_s - min(sooner.values()))
+    later_ms = 1e3 * (ego_delay_s - max(min(sooner.values()), 0.0))
     own = ", ".join(
         f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items()
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition, IntArray
-from fgtrack.evaluation.diagnostics import excluded_lines
+from fgtrack.evaluation.diagnostics.outcomes import excluded_lines
 from fgtrack.evaluation.matching import Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.continuity import (
     breaks,

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import astuple
+from dataclasses import asdict, astuple, dataclass, field
 from time import monotonic
 
 from fgtrack.core.types import (
@@ -23,6 +23,33 @@ from fgtrack.runs.schema import COLUMNS, RUN_FORMAT
 _KEY = 4
 PERIOD_S = 0.2
 """Wall time between two writes of rows. Writing each row by itself would take as long as formatting it."""
+
+
+@dataclass
+class ReceivedLists:
+    """Number and receipts of the lists of one sensor, empty ones included, and its two longest gaps."""
+
+    first_receipt_ns: int
+    count: int = 0
+    last_receipt_ns: int | None = None
+    longest_gaps_ns: list[tuple[int, int]] = field(default_factory=list)
+    """Receipts before and after the two longest gaps, the longest first."""
+
+    def add(self, receipt_ns: int) -> None:
+        """Count a list."""
+        self.count += 1
+        if self.last_receipt_ns is not None:
+            gaps = [*self.longest_gaps_ns, (self.last_receipt_ns, receipt_ns)]
+            gaps.sort(key=lambda gap: gap[0] - gap[1])
+            self.longest_gaps_ns = gaps[:2]
+        self.last_receipt_ns = receipt_ns
+
+    def as_meta(self) -> dict[str, object]:
+        """Return the fields as in meta.json."""
+        return {
+            **asdict(self),
+            "longest_gaps_ns": list(map(list, self.longest_gaps_ns)),
+        }
 
 
 class RunSink(ABC):
@@ -50,6 +77,7 @@ class RunSink(ABC):
         # Counts by sensor and excluding setting: of the tracker, and of the reader.
         self._out_of_bounds: dict[str, Counter[str]] = defaultdict(Counter)
         self._left_out: dict[str, Counter[str]] = defaultdict(Counter)
+        self._lists: dict[str, ReceivedLists] = {}
         # Newest reports on the objects of tracks that have not ended.
         self._objects: dict[int, ObjectReport] = {}
         # Rows of detections without a record yet, by sensor, stamp, receipt and index; duplicates share a key.
@@ -126,6 +154,10 @@ class RunSink(ABC):
 
         The row of a detection follows when its record is written, so both tables have the same order.
         """
+        known = self._lists.get(message.sensor)
+        if known is None:
+            known = self._lists[message.sensor] = ReceivedLists(message.receipt_ns)
+        known.add(message.receipt_ns)
         for row in detection_rows(message):
             self._waiting[row[:_KEY]].append(row)
         if message.origin_deg is not None:
@@ -153,6 +185,9 @@ class RunSink(ABC):
         }
         self._meta |= {
             "counts": counts,
+            "lists": {
+                sensor: one.as_meta() for sensor, one in sorted(self._lists.items())
+            },
             **bounds,
             "complete": True,
             **meta,

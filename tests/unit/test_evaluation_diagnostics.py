@@ -91,6 +91,26 @@ def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
     assert str(again).startswith("lidar: 3 of 3")
 
 
+@pytest.mark.parametrize(("failed", "is_told"), [(6, True), (4, False)])
+def test_failed_detections_above_5_percent_name_the_first_failure(
+    failed: int, is_told: bool, tmp_path: Path
+) -> None:
+    records = [
+        *lists(Disposition.FAILED, failed),
+        *lists(Disposition.IN_SEQUENCE, 100 - failed),
+    ]
+    run = write_run(
+        tmp_path / "run",
+        [[]] * 100,
+        updates={0: records},
+        meta={"effective": SMOOTHER, "first_failure": "KeyError: 3"},
+        config_text=CONFIG,
+    )
+    told = [str(one) for one in diagnostics(run)]
+    line = "lidar: 6 detections failed (6.0 %): the first failure: KeyError: 3"
+    assert told == ([line] if is_told else [])
+
+
 def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     late = [
         update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=3_500_000_000)

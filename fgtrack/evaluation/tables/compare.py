@@ -14,7 +14,7 @@ from fgtrack.evaluation.comparison import (
     entry_columns,
     entry_record,
 )
-from fgtrack.evaluation.diagnostics import USED
+from fgtrack.evaluation.diagnostics.outcomes import USED
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics
 from fgtrack.evaluation.runs import OneRun, evaluated

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 from fgtrack.evaluation.comparison import NEGLIGIBLE, Comparison, Entry
-from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
+from fgtrack.evaluation.diagnostics.noise import FEWEST, is_far_off
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.scores.lagged import WINDOW
