@@ -103,7 +103,8 @@ class CsvTable:
     """Columns of `stamp`, `receipt` (by default the stamp), `object_id` and each component, as in `fields`.
 
     Two columns of a time are whole seconds and nanoseconds, which are added: `stamp:
-    [header.stamp.sec, header.stamp.nanosec]`.
+    [header.stamp.sec, header.stamp.nanosec]`; or a date and a time of day. Four columns
+    of `yaw_rad` are a quaternion x, y, z, w.
     """
     file: str | None = None
     """Name of the file next to the input or inside it; by default the input itself."""
@@ -126,7 +127,7 @@ class CsvInput:
     """CSV files of ego, detections and truth."""
 
     ego: CsvTable | None = None
-    """The ego; `x_m`, `y_m`, `yaw_rad` and `speed_mps` are required."""
+    """The ego; `x_m` and `y_m` are required. Without `yaw_rad` or `speed_mps`, successive positions give them."""
     detections: Mapping[str, CsvTable] = field(default_factory=dict)
     """Detections by sensor; rows with equal stamp and receipt make one list."""
     truth: CsvTable | None = None

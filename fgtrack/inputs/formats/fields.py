@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,10 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
         return None
     if isinstance(path, Field) and any(each in path.unknown for each in present):
         return None
-    raw = present[0] if len(present) == 1 else math.hypot(*present)
+    if name == "yaw_rad" and len(present) == 4:
+        raw = yaw_of(*present)
+    else:
+        raw = present[0] if len(present) == 1 else math.hypot(*present)
     if not isinstance(path, Field):
         return raw
     value = path.value(raw)
@@ -135,12 +139,17 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
 
 def _float(value: Any, path: str) -> float | None:
     if hasattr(value, "w"):  # a quaternion
-        yaw = yaw_rad(value)
-        return math.nan if yaw is None else yaw
+        return yaw_of(value.x, value.y, value.z, value.w)
     try:
         return None if value is None else float(value)
     except (TypeError, ValueError) as error:
         raise FieldError(f"{path}: {str(value)[:40]!r} is not a number") from error
+
+
+def yaw_of(x: float, y: float, z: float, w: float) -> float:
+    """Yaw of a quaternion of any norm; NaN for the quaternion 0."""
+    yaw = yaw_rad(SimpleNamespace(x=x, y=y, z=z, w=w))
+    return math.nan if yaw is None else yaw
 
 
 def objects_by_fields(
@@ -181,12 +190,13 @@ def ego_by_fields(
     receipt_ns: int,
     plane: LocalPlane | None = None,
 ) -> EgoState:
-    """State of the ego; `fields` must contain `x_m`, `y_m`, `yaw_rad` and `speed_mps`."""
+    """State of the ego; heading and speed are NaN if `fields` does not contain them."""
     stamp = _message_stamp(message, fields)
     plane = plane or LocalPlane()
     values = plane.in_plane(
         mapped(fields, (*STATE_NAMES, "in_pit", *GEODETIC), partial(value_at, message))
     )
+    values = {"yaw_rad": math.nan, "speed_mps": math.nan} | values
     return EgoState(receipt_ns if stamp is None else stamp, receipt_ns, **values)
 
 

@@ -8,15 +8,12 @@ value is an empty scan. An empty cell is a missing value. Columns are converted 
 import csv
 import gzip
 import math
-import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from datetime import datetime
-from decimal import Decimal
 from functools import partial
-from io import TextIOWrapper
-from itertools import chain
+from io import StringIO, TextIOWrapper
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -33,7 +30,8 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.inputs.formats.common import exact_ns
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.formats.ego_motion import completed_states, missing_motion
 from fgtrack.inputs.formats.fields import (
     COMPONENTS,
     RELATIVE_IN_MAP,
@@ -43,25 +41,34 @@ from fgtrack.inputs.formats.fields import (
     paths_of,
 )
 from fgtrack.inputs.formats.fusiontracking import LOG_NAME
-from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
+from fgtrack.inputs.formats.table_text import encoding_of, text_form
+from fgtrack.inputs.formats.table_times import (
+    TIMES,
+    Cells,
+    Day,
+    TableTimes,
+    WrongTimeError,
+)
+from fgtrack.inputs.geodetic import GEODETIC, LocalPlane, warn_once
 from fgtrack.inputs.settings import CsvTable, InputConfig
 from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
 
 _ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
-_LONGEST_HEADER = 1_000_000
-_DATE = re.compile(
-    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)Z?(\.\d+)?(?:Z|([+-]\d\d:\d\d))?"
-)
-_TIMES = ("stamp", "receipt")
+WRONG_TIME = "wrong time"
+"""Reason for which rows are left out."""
+#: Rows from which the form of dates is inferred.
+_SAMPLES = 1000
+#: Bytes from which the form of the text is inferred.
+_SAMPLE_BYTES = 1 << 18
 #: Components of the ego and of truth; other roles are detections.
 _NAMES = {
     "ego": (*STATE_NAMES, *GEODETIC),
     "truth": ("object_id", *STATE_NAMES, *GEODETIC),
 }
+_UNKNOWN_MOTION = {"yaw_rad": math.nan, "speed_mps": math.nan}
 #: Required components of the ego and of truth.
-_NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
-Cells = Mapping[str, str]
+_NEEDS = {"ego": STATE_NAMES[:2], "truth": STATE_NAMES[:2]}
 
 
 def read_tables(
@@ -73,10 +80,11 @@ def read_tables(
     does not match the mapping, after all messages up to the receipt of the row before.
     """
     plane = plane or LocalPlane()
+    day = Day()
     keyed: list[tuple[tuple[int, int, int], Message]] = []
     breaks: list[tuple[float, DataError]] = []
     for number, table in enumerate(tables):
-        messages, error = _read(*table, plane)
+        messages, error = _read(*table, plane, day)
         keyed += [((each.receipt_ns, number, each.stamp_ns), each) for each in messages]
         if error is not None:
             breaks.append(
@@ -91,108 +99,163 @@ def read_tables(
 
 
 def _read(
-    file: Path, table: CsvTable, role: str, plane: LocalPlane
+    file: Path,
+    table: CsvTable,
+    role: str,
+    plane: LocalPlane,
+    day: Day,
+    accepts_wrong_times: bool = True,
 ) -> tuple[list[Message], DataError | None]:
-    """Return the messages of the rows that pass the filters, and the error that ends the table."""
-    messages: list[Message] = []
-    scans: dict[tuple[int, int], list[Detection]] = {}
-    stamps_ns: list[int] = []
-    left_out: list[str] = []
-    skipped = None
+    """Return the messages of the rows that pass the filters, and the error that ends the table.
+
+    Rows with wrong times are left out, unless they are more than a tenth of the rows.
+    """
     error = None
     where = str(file)
+    made = _Messages(table, role, plane)
     try:
         result = rows(file, table.delimiter)
         where, header = next(result)
-        for column in [
-            *chain.from_iterable(map(paths_of, table.columns.values())),
-            *table.filters,
-        ]:
-            if column not in header:
-                raise DataError(
-                    f"{where}: has no column {column!r}; its columns are {', '.join(header)}"
-                )
-        for where, cells in result:  # noqa: B007 - the error below contains it
-            if (name := _excluding_filter(table, cells)) is not None:
-                left_out.append(f"filters.{name}")
-                skipped = skipped or cells
-                continue
-            times = _times(cells, table)
-            values = _values(cells, table, role, plane)
-            stamps_ns.append(times[0])
-            if role == "ego":
-                messages.append(EgoState(*times, **values))
-            elif role == "truth":
-                messages.append(TruthState(*times, **{"object_id": 0} | values))
-            else:
-                is_measured = not values.keys().isdisjoint(MEASURABLE)
-                scans.setdefault(times, []).extend(
-                    [Detection(**values)] if is_measured else []
-                )
-        # An empty list reports the rows that were left out.
-        if skipped is not None and not scans and role not in _NAMES:
-            scans[_times(skipped, table)] = []
+        _check_columns(table, header, where)
+        readable = UntilBreak(result)
+        rest = iter(readable)
+        head = list(islice(rest, _SAMPLES))
+        times = TableTimes(table, [cells for _, cells in head], day)
+        for where, cells in chain(head, rest):  # noqa: B007 - the errors below contain it
+            try:
+                made.add(cells, times)
+            except WrongTimeError:
+                if not accepts_wrong_times:
+                    raise
+                made.left_out.append(WRONG_TIME)
+        made.report_left_out(times)
+        readable.raise_error()
     except FieldError as wrong:
         error = DataError(f"{where}: {wrong}")
     except DataError as broken:
         error = broken
-    stamps_ns.sort()
-    few = len(stamps_ns) // 100  # at both ends: single rows may have wrong times
-    if stamps_ns and (
+    num_wrong = made.left_out.count(WRONG_TIME)
+    if num_wrong > made.num_rows // 10:
+        return _read(file, table, role, plane, day, accepts_wrong_times=False)
+    if num_wrong and role in _NAMES:
+        warn_once(f"{file}: left out {num_wrong} rows with wrong times")
+    made.stamps_ns.sort()
+    few = made.num_rows // 100  # at both ends: single rows may have wrong times
+    if made.stamps_ns and (
         text := wrong_unit(
-            len(stamps_ns), stamps_ns[few], stamps_ns[-1 - few], table.time_unit
+            made.num_rows,
+            made.stamps_ns[few],
+            made.stamps_ns[-1 - few],
+            table.time_unit,
         )
     ):
         return [], DataError(f"{file}: {text}: change `time_unit` (input.csv.{role})")
-    for (stamp_ns, receipt_ns), objects in scans.items():
-        counted = tuple(left_out)
-        left_out = []
-        sensor = role.removeprefix("detections.")
-        frame = table.frame or ("map" if GEODETIC[0] in table.columns else "ego")
-        messages.append(
-            DetectionList(
-                sensor, stamp_ns, receipt_ns, objects, frame, counted, plane.origin_deg
+    return made.messages(), error
+
+
+def _check_columns(table: CsvTable, header: Cells, where: str) -> None:
+    """Raise `DataError` if `header` lacks a column of `table`."""
+    mapped_columns = chain.from_iterable(map(paths_of, table.columns.values()))
+    for column in [*mapped_columns, *table.filters]:
+        if column not in header:
+            raise DataError(
+                f"{where}: has no column {column!r}; its columns are {', '.join(header)}"
             )
-        )
-    return messages, error
+
+
+class _Messages:
+    """Messages of a table, made row by row."""
+
+    def __init__(self, table: CsvTable, role: str, plane: LocalPlane) -> None:
+        self._table = table
+        self._role = role
+        self._plane = plane
+        self._states: list[Message] = []
+        self._scans: dict[tuple[int, int], list[Detection]] = {}
+        self._excluded: Cells | None = None
+        self.stamps_ns: list[int] = []
+        """Stamps of the rows that were read."""
+        self.left_out: list[str] = []
+        """Reasons of the rows that were left out."""
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows that were read."""
+        return len(self.stamps_ns)
+
+    def add(self, cells: Cells, times: TableTimes) -> None:
+        """Add a row; raises `FieldError` for a row that does not match the mapping."""
+        if (name := _excluding_filter(self._table, cells)) is not None:
+            self.left_out.append(f"filters.{name}")
+            self._excluded = self._excluded or cells
+            return
+        at = times(cells)
+        values = _values(cells, self._table, self._role, self._plane)
+        self.stamps_ns.append(at[0])
+        if self._role == "ego":
+            self._states.append(EgoState(*at, **_UNKNOWN_MOTION | values))
+        elif self._role == "truth":
+            self._states.append(TruthState(*at, **{"object_id": 0} | values))
+        else:
+            is_measured = not values.keys().isdisjoint(MEASURABLE)
+            self._scans.setdefault(at, []).extend(
+                [Detection(**values)] if is_measured else []
+            )
+
+    def report_left_out(self, times: TableTimes) -> None:
+        """Add an empty list if all rows were excluded; the list reports them."""
+        if self._excluded is None or self._scans or self._role in _NAMES:
+            return
+        self._scans[times(self._excluded)] = []
+
+    def messages(self) -> list[Message]:
+        """Return the messages; the first list of detections counts the rows that were left out."""
+        columns = self._table.columns
+        if self._role == "ego":
+            egos = [each for each in self._states if isinstance(each, EgoState)]
+            return list(completed_states(egos, missing_motion(columns)))
+        sensor = self._role.removeprefix("detections.")
+        frame = self._table.frame or ("map" if GEODETIC[0] in columns else "ego")
+        counted = tuple(self.left_out)
+        lists = []
+        for (stamp_ns, receipt_ns), objects in self._scans.items():
+            at = sensor, stamp_ns, receipt_ns
+            origin_deg = self._plane.origin_deg
+            lists.append(DetectionList(*at, objects, frame, counted, origin_deg))
+            counted = ()
+        return [*self._states, *lists]
 
 
 def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
-    """Yield for each row of `file` its file and line, and its cells by column; the first row is the header.
+    """Yield for each row of `file` its file and line, and its cells by column; the first one is the header.
 
-    Without a `delimiter`, the most frequent of `,`, `;` and tab in the header is used.
-    Raises `DataError` if the file is not a table.
+    Encoding, separator and decimal comma are inferred (`table_text`). Raises
+    `DataError` if the file is not a table.
     """
     where = f"{file}:1"
     try:
-        with (
-            open_file(file) as raw,
-            TextIOWrapper(
-                _unpacked(raw), encoding="utf-8-sig", errors="replace", newline=""
-            ) as text,
-        ):
-            first = text.readline(_LONGEST_HEADER)
-            text.seek(0)
-            separator = delimiter or max(",;\t", key=first.count)
-            lines = iter(text)
-            if separator not in first and delimiter is None and " " in first.strip():
-                separator = " "
-                lines = (" ".join(line.split()) for line in text)
-            reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-            header = [name.strip() for name in next(reader, [])]
+        with open_file(file) as packed:
+            raw = _unpacked(packed)
+            sample = raw.read(_SAMPLE_BYTES)
+            raw.seek(0)
+            text = TextIOWrapper(raw, encoding_of(sample), "replace", newline="")
+            lines = list(StringIO(sample.decode(text.encoding, "replace"), newline=""))
+            form = text_form(lines, delimiter, where)
+            where = f"{file}:{max(form.num_head_lines, 1)}"
+            header = form.header
             named = [name for name in header if name]
             if len(set(named)) < len(named):
                 raise DataError(
                     f"{where}: two columns have the same name: {', '.join(header)}"
                 )
             yield where, dict(zip(header, header, strict=True))
-            for cells in filter(any, reader):
-                where = f"{file}:{reader.line_num}"
+            for number, cells in form.cells(text):
+                where = f"{file}:{number}"
                 if len(cells) != len(header):
                     raise DataError(
                         f"{where}: has {len(cells)} cells, but the header has {len(header)}"
                     )
-                yield where, dict(zip(header, map(str.strip, cells), strict=True))
+                yield where, dict(zip(header, cells, strict=True))
     except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise DataError(f"{where}: cannot be read any further ({error})") from error
 
@@ -202,15 +265,6 @@ def _unpacked(raw: BinaryIO) -> BinaryIO:
     is_packed = raw.read(2) == GZIP_MAGIC
     raw.seek(0)
     return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
-
-
-def _time_ns(text: str, unit: str) -> int:
-    """Convert a number in `unit`, or a date and time (ISO 8601, UTC without a zone), to integer nanoseconds."""
-    if (date := _DATE.fullmatch(text)) is None:
-        return exact_ns(text, unit)
-    day, time, fraction, zone = date.groups()
-    whole_s = datetime.fromisoformat(f"{day}T{time}{zone or '+00:00'}").timestamp()
-    return exact_ns(Decimal(int(whole_s)) + Decimal(fraction or 0))
 
 
 def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
@@ -237,30 +291,6 @@ def _values(
     )
     values |= {name: math.nan for name in _NEEDS.get(role, ()) if values[name] is None}
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
-    """Return stamp and receipt of a row in integer nanoseconds."""
-    times: list[int] = []
-    for name in _TIMES:
-        columns = paths_of(table.columns.get(name, table.columns["stamp"]))
-        if len(columns) > 2:
-            raise FieldError(
-                f"{columns}: a time is one column, or seconds and nanoseconds"
-            )
-        units = [table.time_unit] if len(columns) == 1 else ["s", "ns"]
-        time_ns = 0
-        for column, unit in zip(columns, units, strict=True):
-            try:
-                time_ns += _time_ns(cells[column], unit)
-            except (ArithmeticError, ValueError) as error:
-                raise FieldError(
-                    f"{column}: {cells[column]!r:.40} is not a time in {unit}: "
-                    "correct the cell or `time_unit`"
-                ) from error
-        times.append(time_ns)
-    stamp_ns, receipt_ns = times
-    return receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns
 
 
 def _recognises(path: Path) -> bool:
@@ -312,7 +342,7 @@ def _file(path: Path, table: CsvTable, role: str) -> Path:
     where = f"input.csv.{role}"
     columns = table.columns.keys()
     available = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())
-    known = {*_TIMES, *_NAMES.get(role, COMPONENTS)}
+    known = {*TIMES, *_NAMES.get(role, COMPONENTS)}
     needed = {"stamp", *_NEEDS.get(role, ())}
     if columns - known:
         raise CallError(

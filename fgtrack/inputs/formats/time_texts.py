@@ -15,6 +15,8 @@ from fgtrack.core.time import NS_PER_S, epoch_unit
 from fgtrack.inputs.formats.common import exact_ns
 
 DAY_S = 86_400
+#: Number of texts in which the first time is searched.
+_TRIED = 20
 _TEXT = re.compile(
     r"(?:(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun)[a-z]*,? )?(?P<day>[^:]*?)[T ,]*(?P<clock>\d{1,2}:\d\d(?::\d\d)?|(?<=T)\d{6})Z?"
     r"(?P<fraction>[.,:]\d+)? ?(?P<half>[AaPp][Mm])?"
@@ -75,35 +77,48 @@ class TimeForm:
 def form_of(texts: Iterable[str]) -> TimeForm | None:
     """Return the form of the times in `texts`, of one column; None if they are numbers or have different forms.
 
-    Of several possible forms the one with the shortest duration counts, because the
-    rows of a table follow each other. If that does not decide either, the day comes
-    first, unless the time has AM or PM.
+    A tenth of the texts may have another form. Of several possible forms the one with
+    the shortest duration counts, because the rows of a table follow each other. If that
+    does not decide either, the day comes first, unless the time has AM or PM.
     """
     samples = [text.strip() for text in texts if text.strip()]
-    match = _TEXT.fullmatch(samples[0]) if samples else None
+    match = next(filter(None, map(_TEXT.fullmatch, samples[:_TRIED])), None)
     if match is None:
         return None
     clocks = _HALF_CLOCKS if match["half"] else _CLOCKS
     dates: Sequence[str | None] = (*_ISO, *_DAY_FIRST, *_MONTH_FIRST)
     if match["half"]:
         dates = (*_ISO, *_MONTH_FIRST, *_DAY_FIRST)
-    durations: dict[TimeForm, int] = {}
-    for form in (
-        TimeForm(date, clock)
-        for date, clock in product(dates if match["day"] else (None,), clocks)
-    ):
-        try:
-            times_ns = [form.time_ns(text) for text in samples]
-        except (ValueError, ArithmeticError):
+    best: tuple[int, int] | None = None
+    result = None
+    for date, clock in product(dates if match["day"] else (None,), clocks):
+        form = TimeForm(date, clock)
+        times_ns = _times_ns(form, samples)
+        if times_ns is None:
             continue
-        durations[form] = max(times_ns) - min(times_ns)
-    return min(durations, key=lambda form: durations[form], default=None)
+        ranking = len(samples) - len(times_ns), max(times_ns) - min(times_ns)
+        if best is None or ranking < best:
+            best = ranking
+            result = form
+    return result
 
 
-def on_next_day(time_ns: int, before_ns: int) -> int:
-    """Return the time of day `time_ns` on the day on which it is nearest to `before_ns`."""
+def _times_ns(form: TimeForm, texts: Sequence[str]) -> list[int] | None:
+    """Times of `texts`, without those of another form; None if more than a tenth has another form."""
+    times_ns = list[int]()
+    for number, text in enumerate(texts):
+        try:
+            times_ns.append(form.time_ns(text))
+        except (ValueError, ArithmeticError):
+            if number - len(times_ns) >= len(texts) // 10:
+                return None
+    return times_ns
+
+
+def on_nearest_day(time_ns: int, near_ns: int) -> int:
+    """Return the time of day `time_ns` on the day on which it is nearest to `near_ns`."""
     day_ns = DAY_S * NS_PER_S
-    return time_ns + day_ns * round((before_ns - time_ns) / day_ns)
+    return time_ns + day_ns * round((near_ns - time_ns) / day_ns)
 
 
 def time_in_line_s(text: str) -> float | None:
