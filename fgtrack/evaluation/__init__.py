@@ -39,6 +39,7 @@ _HOMES = {
     "evaluated": "fgtrack.evaluation.runs",
     "evaluation_settings": "fgtrack.evaluation.settings",
     "gospa": "fgtrack.evaluation.scores.multi_object",
+    "t_gospa": "fgtrack.evaluation.scores.t_gospa",
     "lag_metrics": "fgtrack.evaluation.scores.lagged",
     "local_innovations": "fgtrack.evaluation.scores.innovations",
     "match": "fgtrack.evaluation.matching",
@@ -89,6 +90,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.scores.registry import Metric as Metric
     from fgtrack.evaluation.scores.statistics import Distribution as Distribution
     from fgtrack.evaluation.scores.statistics import Moments as Moments
+    from fgtrack.evaluation.scores.t_gospa import t_gospa as t_gospa
     from fgtrack.evaluation.settings import EvaluationConfig as EvaluationConfig
     from fgtrack.evaluation.settings import evaluation_settings as evaluation_settings
     from fgtrack.evaluation.tables import MS as MS

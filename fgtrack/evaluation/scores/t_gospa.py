@@ -50,7 +50,7 @@ def t_gospa(
     )
     shares = np.ones(len(rows))
     changes = 0.0
-    for group in _contested(pairs):
+    for group in _competing_groups(pairs):
         mine = group[pair_of_row]
         used, at = np.unique(ticks[mine], return_inverse=True)
         column = np.cumsum(group)[pair_of_row[mine]] - 1
@@ -76,7 +76,7 @@ def t_gospa(
     }
 
 
-def _contested(pairs: IntArray) -> list[BoolArray]:
+def _competing_groups(pairs: IntArray) -> list[BoolArray]:
     """Return a mask, shape (n,), for each group of pairs that compete for objects or tracks.
 
     `pairs` (2, n) are the object and the track of each pair. A pair without a
@@ -169,6 +169,6 @@ def _shares(gains_m2: FloatArray, pairs: IntArray, switch_m: float) -> FloatArra
         ],
     )
     if solution.x is None:
-        raise FgtrackError(f"T-GOSPA: no solution found: {solution.message}")
+        raise FgtrackError(f"T-GOSPA: the linear program failed: {solution.message}")
     shares: FloatArray = solution.x[variable]
     return shares
