@@ -539,10 +539,8 @@ class Tracker:
         )
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
-        tentative = [
-            parts.lifecycle.status(each) is TrackStatus.TENTATIVE
-            for each in states.track_ids
-        ]
+        statuses, _ = parts.lifecycle.reported(states.track_ids)
+        tentative = [each is TrackStatus.TENTATIVE for each in statuses]
         result = claimed(
             result,
             candidates,
@@ -1022,8 +1020,7 @@ class Tracker:
     ) -> Callable[[], Iterable[TrackReport]]:
         """Return a factory of track reports; status, probability and counters are captured now."""
         parts = self._parts
-        statuses = list(map(parts.lifecycle.status, track_ids))
-        probabilities = list(map(parts.lifecycle.probability, track_ids))
+        statuses, probabilities = parts.lifecycle.reported(track_ids)
         num_measured = list(map(self._num_measured.__getitem__, track_ids))
         objects = parts.objects.reports(track_ids)
         return partial(

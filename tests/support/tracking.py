@@ -5,7 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgtrack.core.types import Detection, DetectionList, FloatArray, Frame
+from fgtrack.core.types import (
+    Detection,
+    DetectionList,
+    FloatArray,
+    Frame,
+    TrackStatus,
+)
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
@@ -96,6 +102,12 @@ def match(
         [(0, 0)],
         StatesAt((track_id,), mean[None], P[None]),
     )
+
+
+def status(life: Lifecycle, track_id: int = 0) -> TrackStatus:
+    """Status of a track."""
+    [found], _ = life.reported([track_id])
+    return found
 
 
 def states(

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from support.tracking import START_NS, candidate, candidates_of, match, ms
+from support.tracking import START_NS, candidate, candidates_of, match, ms, status
 
 from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
@@ -56,7 +56,12 @@ def ego(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0) -> EgoPose:
 
 def probability(life: ExistenceLifecycle, at_ms: float = 0.0) -> float:
     life.expired(START_NS + ms(at_ms))
-    return life.probability(0)
+    return probability_now(life)
+
+
+def probability_now(life: ExistenceLifecycle) -> float:
+    _, [found] = life.reported([0])
+    return found
 
 
 def test_a_miss_and_a_match_change_the_probability_as_integrated_data_association_says() -> (
@@ -162,8 +167,8 @@ def test_the_misses_of_one_sensor_do_not_end_what_another_sees() -> None:
             life.missed(scan("scored", 100.0 * k), [0], there, np.array([10.0])) == []
         )
         life.expired(START_NS + ms(100.0 * k))
-    assert life.status(0) is TrackStatus.COASTING
-    assert life.probability(0) > rules.confirm_probability
+    assert status(life) is TrackStatus.COASTING
+    assert probability_now(life) > rules.confirm_probability
 
 
 @pytest.mark.parametrize(
@@ -185,7 +190,7 @@ def test_a_list_says_nothing_of_what_its_sensor_cannot_see(
     assert (probability(life) < before) is counts
     match(life, 0, scan(at_ms=1.0), HERE, MEAN, P)
     life.missed(scan("ahead", 2.0, ego=ego()), [0], np.array([place]), np.array([20.0]))
-    assert (life.status(0) is TrackStatus.COASTING) is counts
+    assert (status(life) is TrackStatus.COASTING) is counts
 
 
 def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed() -> (
@@ -265,7 +270,7 @@ def test_a_track_that_a_late_list_may_still_show_is_suspended_and_comes_back() -
     match(life, 0, scan("lidar", 500.0, ego=ego()), HERE, MEAN, P)
     assert life.expired(START_NS + ms(now_ms), late(now_ms, 950.0)) == []
     assert life.suspended() == frozenset()
-    assert life.status(0) is not TrackStatus.TENTATIVE
+    assert status(life) is not TrackStatus.TENTATIVE
 
 
 def test_a_suspended_track_ends_when_the_lists_that_could_show_it_should_have_come() -> (
@@ -314,8 +319,8 @@ def test_a_track_is_confirmed_at_the_stamp_of_a_list_however_late_it_comes(
             P,
         )
     life.expired(START_NS + ms(3000.0), late(3000.0, 2900.0))
-    assert life.status(0) is TrackStatus.CONFIRMED
-    assert life.probability(0) < math.exp(
+    assert status(life) is TrackStatus.CONFIRMED
+    assert probability_now(life) < math.exp(
         -2.8 / lifetime_s
     )  # the probability is that of now
 
@@ -383,22 +388,22 @@ def test_a_confirmed_track_is_coasting_when_missed_tentative_when_doubted_and_co
 ):
     life = lifecycle(replace(STILL, doubt_probability=0.6))
     life.born(0, scan(), HERE)
-    assert life.status(0) is TrackStatus.TENTATIVE
+    assert status(life) is TrackStatus.TENTATIVE
     match(life, 0, scan(at_ms=10.0), HERE, MEAN, P)
     life.expired(START_NS + ms(10))
-    assert life.status(0) is TrackStatus.CONFIRMED
+    assert status(life) is TrackStatus.CONFIRMED
     found = []
     for k in range(2, 6):
         life.missed(
             scan(at_ms=10.0 * k), [0], np.array([[10.0, 0.0]]), np.array([10.0])
         )
         life.expired(START_NS + ms(10 * k))
-        found.append(life.status(0))
+        found.append(status(life))
     assert found[0] is TrackStatus.COASTING
     assert found[-1] is TrackStatus.TENTATIVE
     match(life, 0, scan(at_ms=60.0), HERE, MEAN, P)
     life.expired(START_NS + ms(60))
-    assert life.status(0) is TrackStatus.CONFIRMED
+    assert status(life) is TrackStatus.CONFIRMED
 
 
 def test_what_never_moves_is_not_confirmed_and_what_has_moved_stays_so() -> None:
@@ -409,7 +414,7 @@ def test_what_never_moves_is_not_confirmed_and_what_has_moved_stays_so() -> None
         mean = np.array([x_m, 0.0, 0.0, 0.0, 0.0])
         match(life, 0, scan(at_ms=10.0 * k), candidate(x_m, 0.0), mean, P)
         life.expired(START_NS + ms(10 * k))
-        found.append(life.status(0))
+        found.append(status(life))
     assert found == [
         TrackStatus.TENTATIVE,
         TrackStatus.TENTATIVE,

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fgtrack.core.linalg import kernels
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.ego.trajectory import EgoPose
 from fgtrack.tracking.lives.latency import (
@@ -16,7 +17,6 @@ from fgtrack.tracking.lives.latency import (
     Durations,
     Views,
     Watermarks,
-    decided_ns,
 )
 
 MS, S = 1_000_000, 1_000_000_000
@@ -204,8 +204,13 @@ def test_only_sensors_that_could_show_an_object_are_awaited() -> None:
         START_NS - S,
         START_NS - S + 1,
     )  # the list of the last one has not come
-    found = decided_ns(watermarks_ns, could_show, expected_ns)
-    assert found.tolist() == [START_NS, START_NS - S, FOREVER, START_NS - S]
+    decided_ns = kernels("fgtrack.tracking.lives.latency_kernels").decided_ns.py_func
+    found = [
+        decided_ns(own, watermarks_ns, FOREVER, could_show, expected_ns)
+        for own in range(4)
+    ]
+    assert found == [START_NS, START_NS - S, FOREVER, START_NS - S]
+    assert decided_ns(0, watermarks_ns, 5, could_show, expected_ns) == 5
 
 
 def test_a_sensor_could_show_what_is_in_its_view_and_a_camera_shows_no_position() -> (

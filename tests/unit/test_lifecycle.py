@@ -2,7 +2,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from support.tracking import START_NS, candidate, match, ms
+from support.tracking import START_NS, candidate, match, ms, status
 
 from fgtrack.core.types import TrackStatus
 from fgtrack.karle2023.tracker_parts import PublishedLifecycle
@@ -298,16 +298,16 @@ def test_times_are_compared_with_the_present_where_late_lists_are_not_awaited() 
 def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     life = lifecycle(confirm_count=3)
     life.born(0, Scan("both", START_NS, START_NS), HERE)
-    status = []
+    found = []
     for _ in range(2):
         match(life, 0, Scan("both", START_NS, START_NS), HERE)
         life.fused([0])
-        status.append(life.status(0))
+        found.append(status(life))
     life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE[:1], np.array([1.0]))
-    status.append(life.status(0))
+    found.append(status(life))
     match(life, 0, Scan("both", START_NS, START_NS), HERE)
-    status.append(life.status(0))
-    assert status == [
+    found.append(status(life))
+    assert found == [
         TrackStatus.TENTATIVE,
         TrackStatus.CONFIRMED,
         TrackStatus.COASTING,

@@ -23,6 +23,7 @@ MODULES = (
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
     "fgtrack.tracking.lives.counter_kernels",
+    "fgtrack.tracking.lives.existence_kernels",
     "fgtrack.tracking.lives.visibility_kernels",
 )
 #: Names of arguments that are row numbers, or indices of what a row has.
@@ -31,7 +32,7 @@ ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "compo
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {
     "arrive.mean", "correct.y", "faults.means", "innovations.H", "innovations.y",
-    "near.points", "place.H", "propagate.mean", "read.y", "turned.means",
+    "judge.scans_ns", "near.points", "place.H", "propagate.mean", "read.y", "turned.means",
 }  # fmt: skip
 Calls = dict[str, list[Any]]
 

@@ -21,7 +21,7 @@ EVIDENCE = [
 
 def history(log_odds: float = 0.3, share: float = 0.7) -> Histories:
     histories = Histories(2, LIFETIME_S, share, VISIBLE_S)
-    histories.begin(0, 0, log_odds)
+    histories.begin(0, 0, 0, log_odds)
     return histories
 
 
@@ -143,9 +143,11 @@ def test_misses_in_a_row_cost_little_more_than_the_first_and_another_sensor_is_n
 
 def test_many_tracks_with_long_histories_are_as_each_alone() -> None:
     together = Histories(2, LIFETIME_S, 0.7, VISIBLE_S)
-    rows = np.array([together.begin(0, k % 2, 0.1 * k) for k in range(20)])
+    rows = np.arange(20)
+    for k in range(20):
+        together.begin(k, 0, k % 2, 0.1 * k)
     together.end(7)
-    assert together.begin(0, 1, 3.0) == 7
+    together.begin(7, 0, 1, 3.0)
     rng = np.random.default_rng(4)
     alone = history(0.4)
     for k in range(60):

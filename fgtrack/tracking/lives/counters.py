@@ -273,13 +273,17 @@ class CountingLifecycle(Stateful):
         """Probabilities that the objects of tracks exist at a stamp, shape (m,); 1 / 2, as counts give none."""
         return np.full(len(track_ids), 0.5)
 
-    def probability(self, track_id: int) -> float | None:
-        """Probability that the object of the track exists; None, as counts give none."""
-        return None
-
-    def status(self, track_id: int) -> TrackStatus:
-        """Status of the track."""
-        counters = self._counters[self._rows.by_id[track_id]]
-        if counters[NUM_PLACED] < self._rules.confirm_count:
-            return TrackStatus.TENTATIVE
-        return TrackStatus.COASTING if counters[MISSES] else TrackStatus.CONFIRMED
+    def reported(
+        self, track_ids: Sequence[int]
+    ) -> tuple[list[TrackStatus], Sequence[float | None]]:
+        """Return the statuses of tracks, and the probabilities that their objects exist: None, as counts give none."""
+        counters = self._counters[self._rows.of(track_ids)]
+        statuses = [
+            TrackStatus.TENTATIVE
+            if num_placed < self._rules.confirm_count
+            else TrackStatus.COASTING
+            if misses
+            else TrackStatus.CONFIRMED
+            for num_placed, misses in counters[:, NUM_PLACED : MISSES + 1].tolist()
+        ]
+        return statuses, [None] * len(statuses)

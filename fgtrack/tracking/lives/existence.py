@@ -35,33 +35,23 @@ from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Pairs, assigned, near
 from fgtrack.tracking.lives.counters import CountingLifecycle, Scan
-from fgtrack.tracking.lives.latency import FOREVER, NEVER, Views, decided_ns
+from fgtrack.tracking.lives.latency import FOREVER, NEVER, Views
 from fgtrack.tracking.lives.visibility import Histories
 from fgtrack.tracking.preprocess import Candidate, Candidates
+from fgtrack.tracking.rows import FEWEST, TrackRows
 
-
-def _life(num_sensors: int) -> np.dtype[np.void]:
-    """Return the type of the record of one track.
-
-    True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
-    the newest stamps at which it was in view and probably visible. Then by sensor: true if the sensor could show it at
-    the newest stamp `judged_ns` for which that is known, and the newest stamp at which the sensor could.
-    """
-    return np.dtype(
-        [
-            *[
-                ("confirmed", "?"),
-                ("travelled", "?"),
-                ("first_m", "2f8"),
-                ("misses", "i8"),
-            ],
-            *[("in_view_ns", "i8"), ("visible_ns", "i8"), ("judged_ns", "i8")],
-            *[
-                ("could_show", "?", (num_sensors,)),
-                ("expected_ns", "i8", (num_sensors,)),
-            ],
-        ]
-    )
+#: Columns of the life of a track: misses since the last match, newest stamps at which it was in view and probably
+#: visible, and newest stamp for which it is known which sensors could show it.
+MISSES, IN_VIEW, VISIBLE, JUDGED = range(4)
+NUM_LIFE = 4
+#: Columns of its flags: it was ever confirmed, and was as far from its first position as it must be.
+IS_CONFIRMED, IS_TRAVELLED = range(2)
+NUM_FLAGS = 2
+#: Verdicts, and statuses, as the kernels number them.
+STAYS, ENDS, SUSPENDED = range(3)
+TENTATIVE, CONFIRMED, COASTING = range(3)
+_STATUSES = TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.COASTING
+_KERNELS = "fgtrack.tracking.lives.existence_kernels"
 
 
 class _Matches(NamedTuple):
@@ -71,7 +61,7 @@ class _Matches(NamedTuple):
     """Of the tracks, see `ExistenceLifecycle`, shape (m,)."""
     stamp_ns: int
     sensor: int
-    scores: list[float]
+    scores: FloatArray
     """See `ExistenceLifecycle._score`."""
     points_m: FloatArray
     """Shape (m, 2), and of the states at the stamp (m, 2)."""
@@ -143,8 +133,11 @@ class ExistenceLifecycle(Stateful):
         "_histories",
         "_rows",
         "_lives",
+        "_flags",
+        "_first_m",
+        "_could_show",
+        "_expected_ns",
         "_matches",
-        "_reports",
     )
 
     def __init__(
@@ -173,15 +166,20 @@ class ExistenceLifecycle(Stateful):
         self._histories = Histories(
             len(sensors), rules.lifetime_s, rules.visible_share, rules.visible_s
         )
-        self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
-        self._lives = np.zeros(0, dtype=_life(len(sensors)))
+        self._rows = TrackRows()
+        self._lives: IntArray = np.zeros((0, NUM_LIFE), dtype=np.int64)
+        self._flags: BoolArray = np.zeros((0, NUM_FLAGS), dtype=bool)
+        """Shapes (tracks, columns)."""
+        self._first_m: FloatArray = np.zeros((0, 2))
+        """First positions, shape (tracks, 2)."""
+        self._could_show: BoolArray = np.zeros((0, len(sensors)), dtype=bool)
+        """True if the sensor could show the object at the newest stamp for which that is known, (tracks, sensors)."""
+        self._expected_ns: IntArray = np.zeros((0, len(sensors)), dtype=np.int64)
+        """Newest stamp at which the sensor could show the object, shape (tracks, sensors)."""
         self._matches: list[_Matches] = []  # that are not in the histories yet
         own = sensors.values()
         self._P_D = np.array([each.detection_probability for each in own])
         self._clutter = np.array([each.clutter_per_m2 for each in own])
-        self._reports: dict[int, tuple[TrackStatus, float]] | None = (
-            None  # by track id, once they are asked for
-        )
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """See `CountingLifecycle.born`."""
@@ -189,33 +187,38 @@ class ExistenceLifecycle(Stateful):
         log_odds = math.log(odds) + self._score(
             scan, (candidate.leader, *candidate.merged)
         )
-        row = self._rows[track_id] = self._histories.begin(
-            scan.stamp_ns, self._index[scan.sensor], log_odds
-        )
-        if len(self._lives) <= row:
-            more = np.zeros(
-                len(self._histories.counts) - len(self._lives), self._lives.dtype
-            )
-            self._lives = np.concatenate([self._lives, more])
-        self._reports = None
-        could_show = self._views.at_birth(
-            candidate.position_m, scan.ego, self._index[scan.sensor]
-        )
-        stamps_ns = (scan.stamp_ns,) * 3
-        expected_ns = np.where(could_show, scan.stamp_ns, NEVER)
+        own, stamp_ns = self._index[scan.sensor], scan.stamp_ns
+        could_show = self._views.at_birth(candidate.position_m, scan.ego, own)
+        if self._rows.following >= len(self._lives):
+            self._allocate(2 * len(self._lives) or FEWEST)
+        self._histories.begin(self._rows.following, stamp_ns, own, log_odds)
+        row = self._rows.begin(track_id)
+        self._lives[row] = 0, stamp_ns, stamp_ns, stamp_ns
         has_travelled = self._rules.min_travel_m == 0.0
-        self._lives[row] = (
-            False,
-            has_travelled,
-            candidate.position_m,
-            0,
-            *stamps_ns,
-            could_show,
-            expected_ns,
-        )
-        self._confirm(
-            np.array([row]), self._histories.present(np.array([row]), scan.stamp_ns)
-        )
+        exists = self._histories.present(np.array([row]), stamp_ns)[0]
+        is_confirmed = has_travelled and exists >= self._rules.confirm_probability
+        self._flags[row] = is_confirmed, has_travelled
+        self._first_m[row] = candidate.position_m
+        self._could_show[row] = could_show
+        self._expected_ns[row] = np.where(could_show, stamp_ns, NEVER)
+
+    def _allocate(self, num_tracks: int) -> None:
+        """Make larger arrays with the present contents; all are allocated before one is replaced."""
+        present, num_sensors = len(self._lives), len(self._sensors)
+        lives = np.zeros((num_tracks, NUM_LIFE), dtype=np.int64)
+        flags = np.zeros((num_tracks, NUM_FLAGS), dtype=bool)
+        first_m = np.zeros((num_tracks, 2))
+        could_show = np.zeros((num_tracks, num_sensors), dtype=bool)
+        expected_ns = np.zeros((num_tracks, num_sensors), dtype=np.int64)
+        lives[:present], flags[:present] = self._lives, self._flags
+        first_m[:present], could_show[:present] = self._first_m, self._could_show
+        expected_ns[:present] = self._expected_ns
+        self._lives, self._flags, self._first_m = lives, flags, first_m
+        self._could_show, self._expected_ns = could_show, expected_ns
+
+    @property
+    def _arrays(self) -> tuple[IntArray, BoolArray, BoolArray, IntArray]:
+        return self._lives, self._flags, self._could_show, self._expected_ns
 
     def matched(
         self,
@@ -229,23 +232,14 @@ class ExistenceLifecycle(Stateful):
         if not placed:
             return
         chosen, tracks = np.array(placed).T
-        leaders = [candidates.leaders[position] for position in chosen.tolist()]
-        scores = [
-            self._score(scan, (leader, *candidates.merged.get(leader, ())))
-            for leader in leaders
-        ]
-        rows = self._rows_of(states.track_ids[track] for track in tracks.tolist())
-        points_m, means_m = (
-            candidates.lines.take(chosen, axis=0)[:, :2],
-            states.means.take(tracks, axis=0)[:, :2],
-        )
-        P, R = (
-            states.covariances.take(tracks, axis=0)[:, :2, :2],
-            position_covariances(candidates, chosen),
-        )
+        rows = self._rows.of([states.track_ids[track] for _, track in placed])
+        scores = self._scores(scan, candidates, placed)
+        points_m = candidates.lines.take(chosen, axis=0)[:, :2]
+        means_m = states.means.take(tracks, axis=0)[:, :2]
+        P = states.covariances.take(tracks, axis=0)[:, :2, :2]
+        R = position_covariances(candidates, chosen)
         own = scan.stamp_ns, self._index[scan.sensor], scores, points_m, means_m, P, R
         self._matches.append(_Matches(rows, *own))
-        self._reports = None
 
     def _settle(self) -> None:
         """Add the matches since the last time to the histories: of lists of one detection each, many at once."""
@@ -260,17 +254,15 @@ class ExistenceLifecycle(Stateful):
         )
         scores, points_m, means_m, P, R = map(np.concatenate, others)
         self._matches = []
-        self._lives["misses"][rows] = 0
-        self._lives["could_show"][rows, sensors] = True
-        travelled_m = np.hypot(*(means_m - self._lives["first_m"][rows]).T)
-        self._lives["travelled"][rows[travelled_m >= self._rules.min_travel_m]] = True
+        travel = self._rules.min_travel_m, self._first_m
+        kernels(_KERNELS).match(rows, sensors, means_m, *travel, *self._arrays)
         density, P_D = densities(points_m - means_m, P, R), self._P_D[sensors]
-        known = ~np.isnan(density)
         ratios = 1.0 - P_D + P_D * density / self._clutter[sensors] * np.exp(scores)
-        exists = self._learn(
-            *(each[known] for each in (rows, stamps_ns, sensors, ratios))
-        )
-        self._confirm(rows[known], exists)
+        known = ~np.isnan(density)
+        if not known.all():
+            rows, stamps_ns, sensors = rows[known], stamps_ns[known], sensors[known]
+            ratios = ratios[known]
+        self._learn(rows, stamps_ns, sensors, ratios, self._rules.confirm_probability)
 
     def fused(self, track_ids: Iterable[int]) -> None:
         """See `CountingLifecycle.fused`; the match has counted already."""
@@ -284,27 +276,16 @@ class ExistenceLifecycle(Stateful):
     ) -> list[int]:
         """See `CountingLifecycle.missed`."""
         self._settle()
-        sensor, rows, own = (
-            self._sensors[scan.sensor],
-            self._rows_of(track_ids),
-            self._index[scan.sensor],
+        sensor, own = self._sensors[scan.sensor], self._index[scan.sensor]
+        rows, stamp_ns = self._rows.of(track_ids), scan.stamp_ns
+        insort(self._scans_ns, stamp_ns)
+        missed = own, stamp_ns, 1.0 - sensor.detection_probability
+        ratios = kernels(_KERNELS).miss(
+            rows, self._views.of(positions_m, scan.ego), *missed, *self._arrays
         )
-        insort(self._scans_ns, scan.stamp_ns)
-        could_show = self._views.of(positions_m, scan.ego)
-        newest = scan.stamp_ns >= self._lives["judged_ns"][rows]
-        self._lives["could_show"][rows[newest]] = could_show[newest]
-        self._lives["judged_ns"][rows[newest]] = scan.stamp_ns
-        expected_ns = np.where(could_show, scan.stamp_ns, NEVER)
-        self._lives["expected_ns"][rows] = np.maximum(
-            self._lives["expected_ns"][rows], expected_ns
-        )
-        ratios = np.where(
-            could_show[:, own], 1.0 - sensor.detection_probability, np.nan
-        )
-        self._lives["misses"][rows] += ~np.isnan(ratios)
-        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), own)
-        self._learn(rows, stamps_ns, sensors, ratios)
-        self._processed_ns = scan.stamp_ns
+        stamps_ns, sensors = np.full(len(rows), stamp_ns), np.full(len(rows), own)
+        self._learn(rows, stamps_ns, sensors, ratios, math.inf)
+        self._processed_ns = stamp_ns
         return self._ended()
 
     def expired(
@@ -315,11 +296,7 @@ class ExistenceLifecycle(Stateful):
     ) -> list[int]:
         """See `CountingLifecycle.expired`."""
         self._settle()
-        self._present_ns, self._processed_ns, self._reports = (
-            present_ns,
-            processed_ns,
-            None,
-        )
+        self._present_ns, self._processed_ns = present_ns, processed_ns
         if watermarks_ns is not None:
             self._watermarks_ns = watermarks_ns
         oldest_ns = min([present_ns, *self._watermarks_ns.tolist()])
@@ -333,7 +310,7 @@ class ExistenceLifecycle(Stateful):
             return frozenset(self._suspended)
         self._settle()
         improbable = (
-            self._histories.known(self._rows_of(self._suspended), stamp_ns)
+            self._histories.known(self._rows.of(self._suspended), stamp_ns)
             < self._rules.delete_probability
         )
         return frozenset(compress(self._suspended, improbable.tolist()))
@@ -359,8 +336,8 @@ class ExistenceLifecycle(Stateful):
         doubtful = (~likely).nonzero()[0]
         if len(doubtful):
             self._settle()
-            rows = self._rows_of(
-                track_ids[column] for column in pairs.columns[doubtful].tolist()
+            rows = self._rows.of(
+                [track_ids[column] for column in pairs.columns[doubtful].tolist()]
             )
             likely[doubtful] = pairs.values[doubtful] < most(
                 self._histories.present(rows, stamp_ns)
@@ -370,116 +347,68 @@ class ExistenceLifecycle(Stateful):
     def existing(self, track_ids: Sequence[int], stamp_ns: int) -> FloatArray:
         """See `CountingLifecycle.existing`."""
         self._settle()
-        return self._histories.present(self._rows_of(track_ids), stamp_ns)
+        return self._histories.present(self._rows.of(track_ids), stamp_ns)
 
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
         self._settle()
-        row = self._rows.pop(track_id, None)
+        row = self._rows.end(track_id)
         if row is not None:
             self._histories.end(row)
         self._suspended = tuple([each for each in self._suspended if each != track_id])
-        self._reports = None
 
-    def probability(self, track_id: int) -> float:
-        """See `CountingLifecycle.probability`; now."""
-        return self._reported[track_id][1]
-
-    def status(self, track_id: int) -> TrackStatus:
-        """See `CountingLifecycle.status`."""
-        return self._reported[track_id][0]
-
-    @property
-    def _reported(self) -> dict[int, tuple[TrackStatus, float]]:
-        """Status and probability of all tracks, computed together when the first is asked for.
-        The probability is that of now. The status follows from what is known: a late sensor leaves its tracks no doubt.
-        """
-        if self._reports is None:
-            self._settle()
-            rows = self._rows_of(self._rows)
-            lives, exists = (
-                self._lives[rows],
-                self._histories.present(rows, self._present_ns),
-            )
-            known = self._histories.present(rows, self._known_ns(rows))
-            published = lives["confirmed"] & (known >= self._rules.doubt_probability)
-            statuses = [
-                TrackStatus.TENTATIVE
-                if not row[0]
-                else TrackStatus.COASTING
-                if row[1]
-                else TrackStatus.CONFIRMED
-                for row in zip(
-                    published.tolist(), lives["misses"].tolist(), strict=True
-                )
-            ]
-            self._reports = dict(
-                zip(
-                    self._rows, zip(statuses, exists.tolist(), strict=True), strict=True
-                )
-            )
-        return self._reports
-
-    def _rows_of(self, track_ids: Iterable[int]) -> IntArray:
-        return np.array(
-            [self._rows[track_id] for track_id in track_ids], dtype=np.int64
-        )
+    def reported(
+        self, track_ids: Sequence[int]
+    ) -> tuple[list[TrackStatus], Sequence[float | None]]:
+        """See `CountingLifecycle.reported`; probabilities are those of now."""
+        self._settle()
+        rows = self._rows.of(track_ids)
+        codes, exists = np.empty(len(rows), dtype=np.int64), np.empty(len(rows))
+        known = self._watermarks_ns, self._processed_ns, self._present_ns
+        history = self._rules.doubt_probability, *self._arrays, *self._histories.arrays
+        kernels(_KERNELS).report(rows, *known, *history, codes, exists)
+        return [_STATUSES[code] for code in codes.tolist()], exists.tolist()
 
     def _learn(
-        self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray
-    ) -> FloatArray:
-        """Add evidence to the histories, `ratios` NaN out of view; returns existence, see `Histories.learn`, (m,)."""
-        self._reports = None
-        visible, exists = self._histories.learn(rows, stamps_ns, sensors, ratios)
-        in_view = ~np.isnan(ratios)
-        for name, chosen in (("in_view_ns", in_view), ("visible_ns", visible >= 0.5)):
-            np.maximum.at(self._lives[name], rows[chosen], stamps_ns[chosen])
-        np.maximum.at(
-            self._lives["expected_ns"],
-            (rows[in_view], sensors[in_view]),
-            stamps_ns[in_view],
-        )
-        return exists
-
-    def _confirm(self, rows: IntArray, exists: FloatArray) -> None:
-        probable = rows[exists >= self._rules.confirm_probability]
-        self._lives["confirmed"][probable] |= self._lives["travelled"][probable]
-
-    def _decided_ns(self, rows: IntArray) -> IntArray:
-        """Stamps up to which all lists that could show the objects have come and are processed, (m,)."""
-        lives, watermarks_ns = (
-            self._lives[rows],
-            np.minimum(self._watermarks_ns, self._processed_ns),
-        )
-        return decided_ns(watermarks_ns, lives["could_show"], lives["expected_ns"])
-
-    def _known_ns(self, rows: IntArray) -> IntArray:
-        """Stamps at which existence is judged, (m,): those of `_decided_ns`, at most now."""
-        return np.minimum(self._decided_ns(rows), self._present_ns)
+        self,
+        rows: IntArray,
+        stamps_ns: IntArray,
+        sensors: IntArray,
+        ratios: FloatArray,
+        confirm_probability: float,
+    ) -> None:
+        """Add evidence (m,) to the histories, `ratios` NaN out of view; tracks are confirmed from a probability on."""
+        evidence = rows, stamps_ns, sensors, ratios
+        found = *self._histories.learn(*evidence), confirm_probability
+        kernels(_KERNELS).note(*evidence, *found, *self._arrays)
 
     def _ended(self) -> list[int]:
         """Return the ids of the tracks that end, and suspend those that end if nothing more shows them."""
-        rows = self._rows_of(self._rows)
-        lives, decided = self._lives[rows], self._decided_ns(rows)
-        newest_ns = self._newest_scan_ns(decided)
-        gone = newest_ns - lives["in_view_ns"] > self._out_of_view_ns
-        gone |= newest_ns - lives["visible_ns"] > self._hidden_ns
-        known_ns, least = (
-            np.minimum(decided, self._present_ns),
-            self._rules.delete_probability,
+        rows, rules = self._rows.every, self._rules
+        verdicts = np.empty(len(rows), dtype=np.int64)
+        known = self._watermarks_ns, self._processed_ns, self._present_ns
+        scans_ns = np.array(self._scans_ns, dtype=np.int64)
+        limits = self._out_of_view_ns, self._hidden_ns, rules.delete_probability
+        history = *self._arrays, *self._histories.arrays
+        number = kernels(_KERNELS).judge(
+            rows, *known, scans_ns, *limits, *history, verdicts
         )
-        improbable = self._histories.present(rows, known_ns) < least
-        chosen = (improbable & ~gone).nonzero()[0]
-        awaited = chosen[self._histories.known(rows[chosen], known_ns[chosen]) >= least]
-        track_ids = tuple(self._rows)
-        self._suspended = tuple([track_ids[row] for row in awaited.tolist()])
-        improbable[awaited] = False
-        return list(compress(track_ids, (gone | improbable).tolist()))
+        self._suspended = ()
+        if not number:
+            return []
+        by_id = self._rows.by_id
+        self._suspended = tuple(compress(by_id, (verdicts == SUSPENDED).tolist()))
+        return list(compress(by_id, (verdicts == ENDS).tolist()))
 
-    def _newest_scan_ns(self, until_ns: IntArray) -> IntArray:
-        """Newest stamps up to `until_ns` of lists that could have shown the objects, (m,); `NEVER` without a list."""
-        stamps_ns = np.array([NEVER, *self._scans_ns])
-        return np.asarray(stamps_ns[stamps_ns.searchsorted(until_ns, side="right") - 1])
+    def _scores(
+        self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]]
+    ) -> FloatArray:
+        """Return `_score` of the candidates of `pairs`, shape (m,)."""
+        if self._sensors[scan.sensor].score is None or not scan.objects:
+            return np.zeros(len(pairs))
+        leaders = [candidates.leaders[position] for position, _ in pairs]
+        every = [(each, *candidates.merged.get(each, ())) for each in leaders]
+        return np.array([self._score(scan, each) for each in every])
 
     def _score(self, scan: Scan, indices: Iterable[int]) -> float:
         """Logarithm of p(score | object) / p(score | clutter) of the best of some detections; 0 where there is none."""

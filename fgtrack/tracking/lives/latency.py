@@ -235,18 +235,3 @@ class Views:
         )
         views[sensor] = True
         return views
-
-
-def decided_ns(
-    watermarks_ns: IntArray, could_show: BoolArray, expected_ns: IntArray
-) -> IntArray:
-    """Return the stamp up to which all lists that could show each object have come, shape (m,).
-
-    `could_show`: sensors that could show it as far as is known, shape (m, sensors). `expected_ns`: newest stamps at
-    which they could, shape (m, sensors). A sensor counts if it could show the object now, or at a stamp whose list
-    has not come. `FOREVER` where no sensor counts.
-    """
-    counts = could_show | (expected_ns > watermarks_ns)
-    return np.asarray(
-        np.where(counts, watermarks_ns, FOREVER).min(axis=1, initial=FOREVER)
-    )

@@ -6,7 +6,6 @@ Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is
 observed by the lists of that sensor alone, so the joint probability is the product of existence and visibilities.
 """
 
-from heapq import heappop, heappush
 from typing import ClassVar
 
 import numpy as np
@@ -36,7 +35,6 @@ class Histories(Stateful):
         "numbers",
         "entries",
         "counts",
-        "_free",
     )
 
     def __init__(
@@ -59,15 +57,11 @@ class Histories(Stateful):
         """See `RATIO` and `STAMP`, shape (tracks, entries, columns)."""
         self.counts = np.zeros(_FEWEST_TRACKS, dtype=np.int64)
         """Number of entries of each track, 0 of a free row."""
-        self._free = [
-            *range(_FEWEST_TRACKS)
-        ]  # rows, a heap: the first one is taken next
 
-    def begin(self, stamp_ns: int, sensor: int, log_odds: float) -> int:
-        """Return the row of a new track with these log-odds, visible to the `sensor` that started it."""
-        if not self._free:
+    def begin(self, row: int, stamp_ns: int, sensor: int, log_odds: float) -> None:
+        """Begin a track in a `row` with these log-odds, visible to the `sensor` that started it."""
+        while row >= len(self.counts):
             self._grow(axis=0)
-        row: int = self._free[0]
         numbers, entries = self.numbers[row, 0], self.entries[row, 0]
         numbers[:], entries[:] = 0.0, NEVER
         numbers[LOG_ODDS], numbers[VISIBLE + sensor] = (
@@ -76,8 +70,6 @@ class Histories(Stateful):
         )
         entries[STAMP] = entries[VIEWED + sensor] = stamp_ns
         self.counts[row] = 1
-        heappop(self._free)
-        return row
 
     def learn(
         self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray
@@ -98,6 +90,11 @@ class Histories(Stateful):
         )
         return visible, exists
 
+    @property
+    def arrays(self) -> tuple[FloatArray, IntArray, IntArray, float]:
+        """Arguments of `fgtrack.tracking.lives.visibility_kernels.existing_at`."""
+        return self.numbers, self.entries, self.counts, self._chain[0]
+
     def present(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
         """Return the probabilities that the objects exist at `stamps_ns`, not before their newest evidence, (m,)."""
         return self._existing(rows, stamps_ns, is_known=False)
@@ -110,18 +107,16 @@ class Histories(Stateful):
         self, rows: IntArray, stamps_ns: IntArray | int, is_known: bool
     ) -> FloatArray:
         own_ns = np.array(np.broadcast_to(stamps_ns, rows.shape), dtype=np.int64)
-        history = self.numbers, self.entries, self.counts, self._chain[0]
-        return np.asarray(kernels(_KERNELS).existing(rows, own_ns, is_known, *history))
+        found = kernels(_KERNELS).existing(rows, own_ns, is_known, *self.arrays)
+        return np.asarray(found)
 
     def forget(self, oldest_ns: int) -> None:
         """Remember what is older than `oldest_ns` by its outcome alone."""
         kernels(_KERNELS).forget(oldest_ns, self.numbers, self.entries, self.counts)
 
     def end(self, row: int) -> None:
-        """Free the `row` of a track."""
-        if self.counts[row]:
-            self.counts[row] = 0
-            heappush(self._free, row)
+        """Forget the track in a `row`."""
+        self.counts[row] = 0
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the entries of each; all is allocated before anything changes."""
@@ -135,12 +130,4 @@ class Histories(Stateful):
             self.entries,
             self.counts,
         )
-        free = (
-            self._free if axis else [*range(rows, shape[0])]
-        )  # tracks are doubled where none is free
-        self.numbers, self.entries, self.counts, self._free = (
-            numbers,
-            entries,
-            counts,
-            free,
-        )
+        self.numbers, self.entries, self.counts = numbers, entries, counts

@@ -86,7 +86,32 @@ def _existing(
 
 
 @inlined
-def _check(
+def existing_at(
+    own: int,
+    stamp_ns: int,
+    is_known: bool,
+    numbers: FloatArray,
+    entries: IntArray,
+    counts: IntArray,
+    lifetime_s: float,
+) -> float:
+    """Probability that the object of track `own` exists at `stamp_ns`.
+
+    It follows from all evidence, or, where `is_known`, from the evidence up to the stamp. A newer list that could not
+    show the object is no evidence.
+    """
+    k = counts[own] - 1
+    while (
+        k > 0
+        and entries[own, k, STAMP] > stamp_ns
+        and (is_known or math.isnan(numbers[own, k, RATIO]))
+    ):
+        k -= 1
+    return _existing(own, k, stamp_ns, numbers, entries, lifetime_s)
+
+
+@inlined
+def check_histories(
     rows: IntArray, numbers: FloatArray, entries: IntArray, counts: IntArray
 ) -> None:
     """Raise `IndexError` for rows, or numbers of entries, beyond the ends of the arrays."""
@@ -121,7 +146,7 @@ def learn(
     Returns the probabilities of being visible to its sensor, after each, and of existing, the largest one at the stamps
     from each entry on, shapes (m,).
     """
-    _check(rows, numbers, entries, counts)
+    check_histories(rows, numbers, entries, counts)
     num_entries, num_sensors = entries.shape[1], entries.shape[2] - VIEWED
     check_rows(sensors, 0, num_sensors)
     check(
@@ -165,22 +190,14 @@ def existing(
     counts: IntArray,
     lifetime_s: float,
 ) -> FloatArray:
-    """Return existence probabilities at `stamps_ns` (m,), shape (m,).
-    They follow from all evidence, or, where `is_known`, from the evidence up to these stamps. A newer list that could
-    not show the object is no evidence.
-    """
-    _check(rows, numbers, entries, counts)
+    """Return existence probabilities at `stamps_ns` (m,), shape (m,); see `existing_at`."""
+    check_histories(rows, numbers, entries, counts)
     check(len(stamps_ns) >= len(rows))
     result = np.empty(len(rows))
     for m in range(len(rows)):
-        own, k = rows[m], counts[rows[m]] - 1
-        while (
-            k > 0
-            and entries[own, k, STAMP] > stamps_ns[m]
-            and (is_known or math.isnan(numbers[own, k, RATIO]))
-        ):
-            k -= 1
-        result[m] = _existing(own, k, stamps_ns[m], numbers, entries, lifetime_s)
+        result[m] = existing_at(
+            rows[m], stamps_ns[m], is_known, numbers, entries, counts, lifetime_s
+        )
     return result
 
 
