@@ -44,6 +44,12 @@ _CELL_MPS = 30.0
 _CELL_BEARING = 0.3
 #: Largest gap between successive bearings up to the edge of a sector.
 _LINK_RAD = 0.2
+#: Positions farther from their median than this multiple of the quantile are strays, which have no influence on areas.
+_STRAY_FACTOR = 5.0
+_STRAY_QUANTILE = 0.8
+#: Fewest different coordinates of a grid, and its coarsest step.
+_FEWEST_COORDINATES = 5
+_COARSEST_M = 20.0
 #: Margin of the range.
 _RANGE_FACTOR = 1.1
 #: Narrowest sector of vehicle sensors: 20 degrees, long-range RADAR.
@@ -207,7 +213,8 @@ class _Detections:
         num_lists = len(counts)
         gaps_s = np.diff(np.sort(stamps_s))
         span_s = float(np.ptp(receipts_s))
-        sides_m = np.ptp(ranged[:, 1:3], axis=0) if len(ranged) else np.zeros(2)
+        inside = _without_strays(ranged[:, 1:3])
+        sides_m = np.ptp(ranged[inside, 1:3], axis=0) if len(ranged) else np.zeros(2)
         has_enough_lists = num_lists >= _FEWEST_LISTS
         has_area = bool(sides_m.all())
         singles = np.count_nonzero(counts == 1)
@@ -250,11 +257,12 @@ class _Detections:
             )
             seen_m = _rotated(seen_m, np.full(len(seen_m), -mount.yaw_rad))
         if len(ranged):
-            extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(
-                seen_m, _OUTSIDE, axis=0
+            inside_m = seen_m[_without_strays(seen_m)]
+            extent_m = np.quantile(inside_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(
+                inside_m, _OUTSIDE, axis=0
             )
             ranges_m = np.hypot(*seen_m.T)
-            reach_m = float(np.quantile(ranges_m, 1.0 - _OUTSIDE))
+            reach_m = float(np.quantile(np.hypot(*inside_m.T), 1.0 - _OUTSIDE))
             # An object at rest would give an extent of 0.
             area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)
             order = np.argsort(stamps_s, kind="stable")
@@ -264,7 +272,9 @@ class _Detections:
             )
             result = replace(
                 result,
-                persistence=persistence(Lists(stamps_s[order], *columns)),
+                persistence=persistence(
+                    Lists(stamps_s[order], *columns), _grid_std_m(rows[:, 1:3])
+                ),
                 area_m2=area_m2,
             )
         period_s = float(np.median(np.diff(receipts_s))) if num_lists > 1 else 0.0
@@ -333,6 +343,31 @@ def _position(detection: Detection) -> tuple[float, float, float]:
     cosine = math.cos(detection.bearing_rad)
     sine = math.sin(detection.bearing_rad)
     return length * cosine, length * sine, float(detection.range_m is not None)
+
+
+def _without_strays(points_m: FloatArray) -> BoolArray:
+    """Mask (n,) of the positions (n, 2) that are not far from all others."""
+    if not len(points_m):
+        return np.zeros(0, dtype=bool)
+    distances_m = np.hypot(*(points_m - np.median(points_m, axis=0)).T)
+    limit_m = _STRAY_FACTOR * np.quantile(distances_m, _STRAY_QUANTILE)
+    return np.asarray((distances_m <= limit_m) | (limit_m == 0.0))
+
+
+def _grid_std_m(points_m: FloatArray) -> float:
+    """Standard deviation of the rounding to a grid, in x, y or range, of positions (n, 2); 0 without a grid."""
+    steps_m = [0.0]
+    for values in (*points_m.T, np.hypot(*points_m.T)):
+        coordinates = np.unique(np.round(values, 6))
+        gaps_m = np.diff(coordinates)
+        gaps_m = gaps_m[gaps_m > 2e-6]
+        if len(coordinates) < _FEWEST_COORDINATES or not len(gaps_m):
+            continue
+        step_m = float(gaps_m.min())
+        off_m = np.abs(gaps_m - step_m * np.round(gaps_m / step_m))
+        if step_m <= _COARSEST_M and float(off_m.max()) < 0.02 * step_m:
+            steps_m.append(step_m)
+    return max(steps_m) / math.sqrt(12.0)
 
 
 def _rotated(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:

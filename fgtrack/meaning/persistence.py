@@ -35,6 +35,8 @@ _CROWD_M = 50.0
 """Radius of crowds of clutter, for example at a shore or a hedge, in which clutter competes with a track."""
 _CORE = 3.5
 """Largest second difference of one object's positions, in multiples of the scale: 99.8 % of a Rayleigh distribution."""
+_LEAST_STD_M = 0.02
+"""Smallest scatter: exact positions of a simulator differ from a straight line by rounding and by manoeuvres."""
 _PROBABILITY = (0.1, 0.9)
 """Bounds of the estimated detection probability, which is uncertain because occlusions last for several lists."""
 
@@ -109,8 +111,11 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
     return scale_m if scale_m < 0.5 * _scale(np.array(beside_m)) else None
 
 
-def persistence(lists: Lists) -> Persistence | None:
-    """Estimate the persistence of detections; None if too few detections recur in successive lists."""
+def persistence(lists: Lists, grid_std_m: float = 0.0) -> Persistence | None:
+    """Estimate the persistence of detections; None if too few detections recur in successive lists.
+
+    `grid_std_m` is the standard deviation of the rounding of positions to a grid.
+    """
     from scipy.spatial import cKDTree
 
     stamps_s = lists.stamps_s
@@ -136,7 +141,7 @@ def persistence(lists: Lists) -> Persistence | None:
             misfits.append(misfit_m)
             lines.append((k, end_m, velocity_mps))
     misfit = np.array(misfits)
-    scale = _scale(misfit[np.isfinite(misfit)])
+    scale = max(_scale(misfit[np.isfinite(misfit)]), grid_std_m, _LEAST_STD_M)
     in_triple = misfit <= _CORE * scale
     num_triples = int(in_triple.sum())
     reach_m = _CORE * scale * math.sqrt(6.0)

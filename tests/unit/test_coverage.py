@@ -217,3 +217,43 @@ def test_clutter_is_at_most_as_dense_as_all_detections() -> None:
         for k in range(20)
     ]
     assert coverages(line)["any"].density_per_m2 == math.inf
+
+
+@pytest.mark.parametrize("scans", [12, 40, 300])
+@pytest.mark.parametrize("distance_m", [3e3, 1e6, -1e8])
+def test_one_stray_detection_changes_neither_area_nor_density(
+    distance_m: float, scans: int
+) -> None:
+    messages = list(seen(0.0, math.tau, clutter=1.0, scans=scans))
+    expected = coverage(lists(messages))
+    k, points_m = messages[scans // 2]
+    messages[scans // 2] = k, np.append(points_m, [[distance_m, 0.5 * distance_m]], 0)
+    result = coverage(lists(messages))
+    assert result.density_per_m2 == pytest.approx(expected.density_per_m2, rel=0.05)
+    assert result.range_m == expected.range_m
+    if expected.area_m2 is not None:
+        assert result.area_m2 == pytest.approx(expected.area_m2, rel=0.1)
+    if expected.persistence is not None and result.persistence is not None:
+        assert result.persistence.clutter_per_list == pytest.approx(
+            expected.persistence.clutter_per_list, abs=0.3
+        )
+
+
+@pytest.mark.parametrize("step_m", [0.0, 1e-3, 0.1, 0.5, 2.0])
+def test_exact_and_gridded_positions_recur_everywhere(step_m: float) -> None:
+    """Cars on straight lines at all ranges, seen in every list: no range beyond which clutter prevails."""
+    speeds = np.array([[22.0, 0.0], [18.0, 0.3], [-21.0, 0.2], [1.0, 4.0]])
+    starts = np.array([[30.0, 0.0], [160.0, 3.5], [-25.0, -3.5], [10.0, 8.0]])
+    messages: list[Message] = []
+    for k in range(300):
+        points_m = starts + k / 30.0 * speeds  # the stamps are rounded to nanoseconds
+        if step_m:
+            points_m = step_m * np.round(points_m / step_m)
+        objects = [Detection(x_m=x, y_m=y) for x, y in points_m.tolist()]
+        stamp_ns = k * 1_000_000_000 // 30
+        messages.append(DetectionList("one", stamp_ns, stamp_ns, objects, "ego"))
+    result = coverage(messages).persistence
+    assert result is not None
+    assert result.max_range_m is None
+    assert result.detection_probability == pytest.approx(0.9)
+    assert result.clutter_per_list < 0.1
