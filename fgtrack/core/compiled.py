@@ -120,6 +120,7 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
 
 def inlined(function: _Function) -> _Function:
     """Decorate a function that only compiled functions call: it becomes a part of the machine code of each caller."""
+    _stamp(function.__globals__)  # the stored code of callers ends with this source
     options = {
         "forceinline": True,
         **_OPTIONS,
@@ -131,10 +132,11 @@ def inlined(function: _Function) -> _Function:
 
 
 def merged(function: _Function) -> _Function:
-    """Decorate a small function with one caller: its statements become statements of the caller before compiling.
+    """Decorate a small function with few callers: its statements become statements of the callers before compiling.
 
     An `inlined` function is compiled alone, too, which takes longer. Decorate a large function with `shared`.
     """
+    _stamp(function.__globals__)  # the stored code of callers ends with this source
     return cast(_Function, numba.njit(**_OPTIONS, inline="always")(function))
 
 
@@ -298,6 +300,13 @@ def solve(S: FloatArray, columns: FloatArray) -> bool:
         for c in range(columns.shape[1]):
             columns[i, c] /= S[i, i]
     return True
+
+
+@inlined
+def regularise(Q: FloatArray) -> None:
+    """Add a small diagonal to process noise that is singular, as `fgtrack.core.linalg.regular` does."""
+    for i in range(Q.shape[0]):
+        Q[i, i] += 1e-12 * max(Q[i, i], 1e-6)
 
 
 @shared(f"float64({MATRIX}, float64[::1])")

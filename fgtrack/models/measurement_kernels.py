@@ -1,7 +1,7 @@
 """The measurement models of the shipped components, compiled: values h, Jacobians H, residuals; and robust losses.
 
 Components have numbers, their indices in `COMPONENTS`. A sensor pose is x, y, yaw, vx and vy, shape (5,), see
-`fgtrack.models.measurement.SensorPose`. States are x, y and either yaw, speed or vx, vy, and what follows.
+`fgtrack.models.measurement.SensorPose`. A state begins with x, y, yaw, speed, or with x, y, vx, vy.
 """
 
 import math
@@ -27,11 +27,25 @@ YAW, SPEED, RANGE, BEARING, RANGE_RATE, CURVATURE = (
 )
 NUM_COMPONENTS, POSE_SIZE = len(COMPONENTS), 5
 GAUSSIAN, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, DCS = range(len(KINDS))
+STACK = "Tuple((int64[::1], float64[::1], int64, float64[:, ::1], float64[:, :, ::1]))"
+Stack = tuple[IntArray, FloatArray, int, FloatArray, FloatArray]
+"""m measurements of one sensor: codes of the components (k,), sensor pose with the width of the robust loss (6,), kind
+of the loss, values z (m, k), and covariances R (m, k, k)."""
+
+
+@inlined
+def check_stack(stack: Stack, m: int, k: int, n: int) -> None:
+    """Raise `IndexError` unless a stack has m measurements of k components that a state of n entries has."""
+    components, view, _, z, R = stack
+    check_components(components, n)
+    check(k > 0 and len(components) == k and len(view) > POSE_SIZE)
+    check(len(z) >= m and len(R) >= m and z.shape[1] == k)
+    check(R.shape[1] == k and R.shape[2] == k)
 
 
 @inlined
 def check_components(codes: IntArray, n: int) -> None:
-    """Raise `IndexError` unless `codes` are components that a state of n entries has."""
+    """Raise `IndexError` unless `codes` are codes of components that a state of n entries has."""
     check(n >= 4)
     for code in codes:
         check(0 <= code < NUM_COMPONENTS and (code != CURVATURE or n > YAW_RATE))
@@ -48,9 +62,9 @@ def observe(
 ) -> None:
     """Write the components h (k,) of the state x (n,) seen from `pose` (5,), and their Jacobian H (k, n).
 
-    The gradient of a bearing stays below `MIN_RANGE_M` as it is there, the gradient of the yaw of a Cartesian state
-    below `MIN_SPEED_MPS`. A curvature is the yaw rate over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`,
-    which falls to 0 at rest.
+    Below `MIN_RANGE_M` the gradient of a bearing is the gradient at `MIN_RANGE_M`. Below `MIN_SPEED_MPS` the gradient
+    of the yaw of a Cartesian state is the gradient at `MIN_SPEED_MPS`. A curvature is the yaw rate over the speed v,
+    times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`. This factor falls to 0 at rest.
     """
     k, n = len(codes), len(x)
     if codes[k - 1] > SPEED:  # components are in ascending order
@@ -107,7 +121,7 @@ def observe(
 def subtract(
     codes: IntArray, z: FloatArray, h: FloatArray, residual: FloatArray
 ) -> None:
-    """Write z - h (k,) with angles in (-pi, pi]; `residual` may be one of the two."""
+    """Write z - h (k,) with angles in (-pi, pi]; `residual` may be `z` or `h`."""
     for a in range(len(codes)):
         residual[a] = z[a] - h[a]
         if codes[a] == YAW or codes[a] == BEARING:

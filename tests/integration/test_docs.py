@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(
     path.relative_to(ROOT)
     for path in chain(
-        ROOT.glob("*.md"), ROOT.glob("docs/*.md"), ROOT.glob("experiments/**/README.md")
+        ROOT.glob("*.md"), ROOT.glob("docs/*.md"), ROOT.glob("experiments/**/*.md")
     )
 )
 TUTORIALS = sorted((ROOT / "docs/tutorials").glob("plot_*.py"))
@@ -525,3 +525,19 @@ def leaves(value: Any, path: str = "") -> Iterator[str]:
     ):
         yield from leaves(inner, f"{path}.{key}")
     yield path
+
+
+def test_the_first_lines_of_the_readme_give_numbers_of_its_table() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lead, _, rest = text.partition("## The problem")
+    table = rest.split("## What the comparison shows")[1].split("\n## ")[0]
+    interval = r"([+-]?[\d.]+)( %)? \(([+-]?[\d.]+) to ([+-]?[\d.]+)\)"
+
+    def sizes(part: str) -> set[tuple[float, ...]]:
+        return {
+            (abs(float(value)), *sorted((abs(float(low)), abs(float(high)))))
+            for value, _, low, high in re.findall(interval, part)
+        }
+
+    assert len(sizes(lead)) == 4
+    assert sizes(lead) <= sizes(table)

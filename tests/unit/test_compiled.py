@@ -45,7 +45,10 @@ def stored(
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
     def load(callee: str, caller: str) -> Any:
-        head = "from fgtrack.core.compiled import inlined, njit, shared\nOFFSET = 1\n"
+        head = (
+            "from fgtrack.core.compiled import inlined, merged, njit, shared\n"
+            "OFFSET = 1\n"
+        )
         loaded(tmp_path / "callee.py", head + callee)
         return loaded(
             tmp_path / "caller.py",
@@ -88,6 +91,17 @@ def test_what_is_stored_of_a_caller_is_not_used_after_another_module_changed(
     assert stored(SHARED, CALLER).call(3) == 7.0
     after = stored(changed, CALLER).call
     assert after(3) == (7.5 if "OFFSET" in changed else 8.5)
+    assert after.stats.cache_misses
+
+
+@pytest.mark.parametrize("decorator", ["@inlined", "@merged"])
+def test_what_is_stored_is_not_used_after_a_module_without_own_loops_changed(
+    stored, decorator: str
+) -> None:
+    callee = f"{decorator}\ndef twice(x):\n    return 2 * x\n"
+    assert stored(callee, CALLER).call(3) == 7.0
+    after = stored(callee.replace("2 *", "4 *"), CALLER).call
+    assert after(3) == 13.0
     assert after.stats.cache_misses
 
 
@@ -368,3 +382,18 @@ def test_the_inside_of_numba_is_imported_in_one_file() -> None:
         path.name for path in package.rglob("*.py") if inside.search(path.read_text())
     ]
     assert found == ["numba_internals.py"]
+
+
+def test_the_makefile_compiles_every_module_of_loops_before_the_tests() -> None:
+    root = Path(compiled.__file__).parents[2]
+    decorator = re.compile(r"^@(njit|shared)\(", re.MULTILINE)
+    modules = {
+        ".".join(path.relative_to(root).with_suffix("").parts)
+        for path in (root / "fgtrack").rglob("*.py")
+        if decorator.search(path.read_text(encoding="utf-8"))
+    } - {"fgtrack.core.compiled"}  # which all others import
+    makefile = (root / "Makefile").read_text(encoding="utf-8")
+    short = dict(re.findall(r"^([KS]) := (\S+)$", makefile, re.MULTILINE))
+    lists = re.findall(r"LOOPS := ((?:.*\\\n)*.*)", makefile)
+    named = re.sub(r"\$\(([KS])\)", lambda found: short[found[1]], " ".join(lists))
+    assert set(re.findall(r"fgtrack[\w.]+", named)) == modules

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = sorted((ROOT / "fgtrack").rglob("*.py"))
 DOCS = sorted((ROOT / "docs").glob("*.md"))
-EXPERIMENTS = sorted((ROOT / "experiments").rglob("README.md"))
+EXPERIMENTS = sorted((ROOT / "experiments").rglob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS, *EXPERIMENTS]
 #: Words with which no docstring begins: it begins with what is returned, or with a noun.
 OPENINGS = ("What", "Whether", "Of", "Those", "How", "So")

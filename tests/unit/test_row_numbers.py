@@ -18,8 +18,12 @@ MODULES = (
     "fgtrack.estimation.kernels.kalman",
     "fgtrack.estimation.kernels.replay",
     "fgtrack.karle2023.storage_kernels",
-    "fgtrack.estimation.smoothing.kernels",
-    "fgtrack.estimation.smoothing.node_kernels",
+    "fgtrack.estimation.smoothing.factor_kernels",
+    "fgtrack.estimation.smoothing.insertion_kernels",
+    "fgtrack.estimation.smoothing.interpolation_kernels",
+    "fgtrack.estimation.smoothing.linearisation_kernels",
+    "fgtrack.estimation.smoothing.relinearisation_kernels",
+    "fgtrack.estimation.smoothing.solution_kernels",
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
     "fgtrack.tracking.lives.counter_kernels",
@@ -32,7 +36,7 @@ ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "compo
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {
     "arrive.mean", "correct.y", "faults.means", "innovations.H", "innovations.y",
-    "judge.scans_ns", "near.points", "place.H", "propagate.mean", "read.y", "turned.means",
+    "judge.scans_ns", "near.points", "place.linearised1", "propagate.mean", "read.y", "turned.means",
 }  # fmt: skip
 Calls = dict[str, list[Any]]
 

@@ -1,6 +1,6 @@
 """The replaying EKFs of all objects in arrays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
@@ -51,8 +51,10 @@ _STATUS = (
     UpdateStatus.OUT_OF_SEQUENCE,
 )
 _FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
-#: Column of `labels` at which the components begin, see the kernels.
+#: Column of `labels` at which the codes of the components begin, see `kernels.replay_arrays`.
 CODES = 3
+Stack = tuple[IntArray, FloatArray, int, FloatArray, FloatArray]
+"""Measurements as compiled loops take them, see `fgtrack.models.measurement_kernels.Stack`."""
 
 
 class Outside(NamedTuple):
@@ -114,7 +116,7 @@ class ReplayBank(Stateful):
         self._outside: dict[int, dict[int, Outside]] = {}
         """Steps that compiled loops cannot take alone, by row and slot."""
         self._free: list[int] = []
-        self._arrays = list[Any]()
+        self._arrays: tuple[Any, ...] = ()
         self._shape: tuple[int, ...] = 0, 0, 0  # numbers of tracks, steps, components
         self._allocate(8, 64, 4)
 
@@ -129,7 +131,10 @@ class ReplayBank(Stateful):
         return tuple(self._rows)
 
     def _allocate(self, *least: int) -> None:
-        """Make arrays for at least so many tracks, steps and components with the present contents (see the kernels)."""
+        """Make arrays for at least `least` tracks, steps and components, and copy the present contents.
+
+        The arrays are those of `fgtrack.estimation.kernels.replay_arrays`.
+        """
         present, n = self._shape[0], self._motion.dim
         rows, slots, k = shape = tuple(map(max, self._shape, (*least, 0, 0)))
         arrays = [
@@ -152,7 +157,7 @@ class ReplayBank(Stateful):
             arrays[4][*used, : measured.shape[2], : measured.shape[3]] = measured[used]
             arrays[5][used] = views[used]
         free = [*self._free, *range(present, rows)]
-        self._arrays, self._shape, self._free = arrays, shape, free
+        self._arrays, self._shape, self._free = tuple(arrays), shape, free
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -280,40 +285,30 @@ class ReplayBank(Stateful):
             )
             if k > self._shape[2]:
                 self._allocate(0, 0, k)
-            z, R = (
-                np.ascontiguousarray(one.z, dtype=np.float64),
-                np.ascontiguousarray(one.R, dtype=np.float64),
-            )
-            y, S, nis, status = (
+            y, S, nis, status = written = (
                 np.empty((m, k)),
                 np.empty((m, k, k)),
                 np.empty(m),
                 np.empty(m, dtype=np.int64),
             )
-            loss, width = compiled_form(one.loss, k)
-            now = self._lag_ns, self._start_ns, stamp_ns
-            view = np.array([*one.pose, width])
             fuse = partial(
                 kernels(_KERNELS).fuse,
                 self._kind,
                 self._noise,
-                *self._arrays,
+                self._arrays,
                 rows,
-                *now,
-                one.model.codes,
-                view,
-                loss,
-                z,
-                R,
+                (self._lag_ns, self._start_ns, stamp_ns),
+                _stack(one),
+                one.measured,
             )
-        if not fuse(one.measured, y, S, nis, status):
+        if not fuse(written):
             return _results(y, S, nis, status)
         outcomes = Outcomes()
         for is_full in (False, True):
             chosen = ((status == _NO_ROOM) == is_full).nonzero()[0]
             ids = [track_ids[k] for k in chosen.tolist()]
             if is_full:
-                part = replace(one, z=z[chosen], R=R[chosen])
+                part = replace(one, z=one.z[chosen], R=one.R[chosen])
                 outcomes.add(
                     ids, partial(self._fused_in_more_room, stamp_ns, ids, part)
                 )
@@ -357,7 +352,7 @@ class ReplayBank(Stateful):
         )
         at = rows, self._start_ns, stamp_ns, is_present
         count = kernels(_KERNELS).ahead(
-            self._kind, self._noise, *self._arrays[:4], *at, means, covariances, known
+            self._kind, self._noise, self._arrays, *at, means, covariances, known
         )
         return count, known, means, covariances
 
@@ -396,20 +391,10 @@ class ReplayBank(Stateful):
 
         `steps` are those of `_outside`. Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
         """
-        loss, width = compiled_form(one.loss, len(one.z))
         order, _, _, windows, _, _ = self._arrays
-        index = self._call(
-            "insert",
-            row,
-            self._start_ns,
-            one.stamp_ns,
-            one.model.codes,
-            np.array([*one.pose, width]),
-            loss,
-            np.ascontiguousarray(one.z, dtype=np.float64),
-            np.ascontiguousarray(one.R, dtype=np.float64),
-            with_measured=True,
-        )
+        times_ns = self._lag_ns, self._start_ns, one.stamp_ns
+        stack = _stack(replace(one, z=one.z[None], R=one.R[None]))
+        index = kernels(_KERNELS).insert(self._arrays, np.array([row]), times_ns, stack)
         if index < 0:
             return None if -index == _NO_ROOM else UpdateResult(_STATUS[-index])
         last = int(windows[row, 0])
@@ -425,14 +410,6 @@ class ReplayBank(Stateful):
         status = UpdateStatus.IN_SEQUENCE if is_newest else UpdateStatus.OUT_OF_SEQUENCE
         return UpdateResult(status, y, nis, S)
 
-    def _call(
-        self, name: str, row: int, *arguments: Any, with_measured: bool = False
-    ) -> Any:
-        """Call a loop of `fgtrack.estimation.kernels.replay` for one track."""
-        arrays = self._arrays if with_measured else self._arrays[:4]
-        loop: Callable[..., Any] = getattr(kernels(_KERNELS), name)
-        return loop(self._kind, self._noise, *arrays, np.array([row]), *arguments)
-
     def _replay_step(self, row: int, index: int, steps: dict[int, Outside]) -> None:
         """Predict a step and fuse its measurement; while the direction is sought, the state is that along the line.
         Raises `numpy.linalg.LinAlgError` where that is impossible.
@@ -441,7 +418,8 @@ class ReplayBank(Stateful):
         before, slot = order[row, index - 1 : index + 1].tolist()
         step, k = steps.get(slot, _INSIDE), int(labels[row, slot, 1])
         y, H = np.empty(k), np.empty((k, n))
-        self._call("predict_step", row, index)
+        loops, tracks = kernels(_KERNELS), np.array([row])
+        loops.predict_step(self._kind, self._noise, self._arrays, tracks, index)
         if step.measurement is not None and step.is_plugin:
             y, H = (
                 np.array(each, dtype=np.float64, order="C")
@@ -449,8 +427,8 @@ class ReplayBank(Stateful):
                     step.measurement.z, states[row, slot, 0], step.measurement.pose
                 )
             )
-        if not self._call(
-            "correct_step", row, index, step.is_plugin, y, H, with_measured=True
+        if not loops.correct_step(
+            self._kind, self._arrays, tracks, index, step.is_plugin, y, H
         ):
             raise np.linalg.LinAlgError("a measurement cannot be fused")
         search = steps.get(before, _INSIDE).search
@@ -478,7 +456,9 @@ class ReplayBank(Stateful):
         now = self._retrodicted_along_line(row, index, last, one.stamp_ns, steps)
         if now is None:
             now = np.empty((n + 1, n))
-            if not self._call("retrodict", row, index, last, now):
+            if not kernels(_KERNELS).retrodict(
+                self._kind, self._noise, self._arrays, np.array([row]), index, last, now
+            ):
                 raise np.linalg.LinAlgError("a prediction has no root")
         y, H = one.model.linearised(one.z, now[0], one.pose)
         S, nis, _ = kernels("fgtrack.estimation.kernels.kalman").innovations(
@@ -527,6 +507,18 @@ class ReplayBank(Stateful):
             self._outside[row] = kept
         else:
             self._outside.pop(row, None)
+
+
+def _stack(one: Measurement) -> Stack:
+    """Return a stack of measurements, z (m, k) and R (m, k, k), as compiled loops take it."""
+    loss, width = compiled_form(one.loss, one.z.shape[-1])
+    return (
+        one.model.codes,
+        np.array([*one.pose, width]),
+        loss,
+        np.ascontiguousarray(one.z, dtype=np.float64),
+        np.ascontiguousarray(one.R, dtype=np.float64),
+    )
 
 
 def _results(

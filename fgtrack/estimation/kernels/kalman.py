@@ -13,6 +13,7 @@ from fgtrack.core.compiled import (
     check,
     check_rows,
     copy,
+    merged,
     njit,
     product,
     scratch,
@@ -38,6 +39,23 @@ CorrectionSpace = tuple[
     FloatArray,
 ]
 """Scratch of `correct_state`: (n, n) twice, (k, n), (n, k), (k, k) three times and (k, 1), for the largest k."""
+
+
+@merged
+def correction_space(n: int, k: int) -> CorrectionSpace:
+    """Return scratch for corrections of states of dimension n by measurements of at most k components."""
+    return (
+        scratch(n, n),
+        scratch(n, n),
+        scratch(k, n),
+        scratch(n, k),
+        scratch(k, k),
+        scratch(k, k),
+        scratch(k, k),
+        scratch(k, 1),
+    )
+
+
 _VECTORS, _MATRICES, _READ = (
     "float64[:, ::1]",
     "float64[:, :, ::1]",
@@ -333,14 +351,8 @@ def correct(
     check(len(H) == 1 or len(H) >= m)
     check(P.shape[1] == n and P.shape[2] == n and H.shape[1] == k and H.shape[2] == n)
     check(R.shape[1] == k and R.shape[2] == k and S.shape[1] == k and S.shape[2] == k)
-    A, AP, K, KR = scratch(n, n), scratch(n, n), scratch(k, n), scratch(n, k)
-    root, spread, own, column = (
-        scratch(k, k),
-        scratch(k, k),
-        scratch(k, k),
-        scratch(k, 1),
-    )
-    space, white = (A, AP, K, KR, root, spread, own, column), scratch(k)
+    space, white = correction_space(n, k), scratch(k)
+    K, root = space[2], space[4]
     for i in range(m):
         h = H[min(i, len(H) - 1)]
         copy(R[i], S[i])

@@ -16,8 +16,9 @@ from fgtrack.core.state import Snapshot, Stateful, copied_attributes, put_back
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
-from fgtrack.estimation.smoothing import node_kernels
-from fgtrack.estimation.smoothing.kernels import (
+from fgtrack.estimation.smoothing import insertion_kernels, linearisation_kernels
+from fgtrack.estimation.smoothing.node_arrays import (
+    AHEAD_S,
     CHANGED,
     COUNT,
     FILTERED,
@@ -28,15 +29,20 @@ from fgtrack.estimation.smoothing.kernels import (
     NONLINEAR,
     NUM_PLUGINS,
     NUM_ROWS,
+    NUM_VALUES,
     ORIGIN,
+    PLUGIN,
+    POSE,
     PREDICTED,
     REFERENCE,
+    ROOT,
     ROWS_STALE,
     STALE,
     C,
     F,
     P,
     Q,
+    Z,
 )
 from fgtrack.estimation.smoothing.terms import NEAR_NS, MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
@@ -92,8 +98,8 @@ class Nodes(Stateful):
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
         self.marks = np.zeros((size, 3, _FEW_COMPONENTS), dtype=np.int64)
-        self.values = np.zeros((size, node_kernels.NUM_VALUES, _FEW_COMPONENTS))
-        """Measurements as compiled loops linearise them, see `node_kernels`."""
+        self.values = np.zeros((size, NUM_VALUES, _FEW_COMPONENTS))
+        """Measurements as compiled loops linearise them, see `node_arrays`."""
         self.has_plugins = self.compiled is None
         """True if plug-ins model the motion, or have modelled a measurement: these are linearised outside the loops."""
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
@@ -263,7 +269,7 @@ class Nodes(Stateful):
         view = np.array([*measurement.pose, width], dtype=np.float64)
         if self.compiled is None or not measurement.model.is_compiled:
             self.has_plugins = True
-            loss = node_kernels.PLUGIN
+            loss = PLUGIN
         return codes, view, loss
 
     def widen(self, num_rows: int) -> None:
@@ -282,12 +288,12 @@ class Nodes(Stateful):
             k, values = len(codes), self.values[number]
             of = slice(row, row + k)
             self.marks[number, :, of] = codes, np.full(k, k), np.full(k, loss)
-            values[node_kernels.Z, of] = measurement.z
-            values[node_kernels.POSE : node_kernels.AHEAD_S, of] = view[:, None]
-            values[node_kernels.AHEAD_S, of] = ahead_s
+            values[Z, of] = measurement.z
+            values[POSE:AHEAD_S, of] = view[:, None]
+            values[AHEAD_S, of] = ahead_s
             root = np.linalg.cholesky(measurement.R)
-            values[node_kernels.ROOT : node_kernels.ROOT + k, of] = root.T
-            self.labels[number, NUM_PLUGINS] += loss == node_kernels.PLUGIN
+            values[ROOT : ROOT + k, of] = root.T
+            self.labels[number, NUM_PLUGINS] += loss == PLUGIN
             row += k
         self.labels[number, NUM_ROWS], self.labels[number, ROWS_STALE] = used, 1
 
@@ -319,10 +325,10 @@ class Nodes(Stateful):
         self.first[track] -= index < self.first[track]
 
     def windows(self, tracks: IntArray, *limits_ns: int) -> IntArray:
-        """Return `node_kernels.windows` of `tracks`, shape (4, m), with room for another node in each."""
+        """Return `insertion_kernels.windows` of `tracks`, shape (4, m), and make room for another node in each."""
         out = np.empty((4, len(tracks)), dtype=np.int64)
         if (
-            node_kernels.windows(tracks, *limits_ns, self.arrays, out)
+            insertion_kernels.windows(tracks, *limits_ns, self.arrays, out)
             >= self.stamps_ns.shape[1]
         ):
             self._grow(axis=1)
@@ -357,7 +363,7 @@ class Nodes(Stateful):
             for number in self.numbers[tracks[rows], indices].tolist():
                 self.linearise_factors(number)
         if compiled is not None:
-            node_kernels.linearise(
+            linearisation_kernels.linearise(
                 compiled.kind, compiled.noise, tracks, starts, self.arrays, self.seen
             )
             return

@@ -11,15 +11,21 @@ from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.smoothing import kernels, node_kernels
-from fgtrack.estimation.smoothing.kernels import (
+from fgtrack.estimation.smoothing import (
+    insertion_kernels,
+    interpolation_kernels,
+    linearisation_kernels,
+    relinearisation_kernels,
+    solution_kernels,
+)
+from fgtrack.estimation.smoothing.insertion_kernels import BEHIND, NO_ROOM, NOT_DEFINITE
+from fgtrack.estimation.smoothing.node_arrays import (
     BEGIN_NS,
     NEVER,
     NONLINEAR,
     ROWS_STALE,
     STALE,
 )
-from fgtrack.estimation.smoothing.node_kernels import BEHIND, NO_ROOM, NOT_DEFINITE
 from fgtrack.estimation.smoothing.nodes import Nodes
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import cost, overshot
@@ -89,8 +95,8 @@ class Solver(Stateful):
     def _solve(
         self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool
     ) -> None:
-        """Solve windows, see `kernels.solve_windows`."""
-        if not kernels.solve_windows(
+        """Solve windows, see `solution_kernels.solve_windows`."""
+        if not solution_kernels.solve_windows(
             tracks, starts, anchors, is_partial, self.nodes.arrays
         ):
             raise np.linalg.LinAlgError("a state is not finite")
@@ -102,7 +108,7 @@ class Solver(Stateful):
         Return the means of these nodes, or where `after_s` those before, shape (m, n).
         """
         means = np.empty((len(tracks), self.motion.dim))
-        kernels.smooth(tracks, indices, after_s, self.nodes.arrays, means)
+        solution_kernels.smooth(tracks, indices, after_s, self.nodes.arrays, means)
         return means
 
     # --- states
@@ -115,12 +121,12 @@ class Solver(Stateful):
         """
         nodes, indices = self.nodes, np.empty(len(tracks), dtype=np.int64)
         until_s, after_s = np.empty((2, len(tracks)))
-        num_between = kernels.locate(
+        num_between = interpolation_kernels.locate(
             tracks, stamps_ns, nodes.arrays, indices, until_s, after_s
         )
         mean, F, Q = nodes.transition(self.smoothed(tracks, indices, after_s), until_s)
         ahead = nodes.transition(mean, after_s) if num_between else (mean, F, Q)
-        if not kernels.arrive(
+        if not interpolation_kernels.arrive(
             tracks, indices, after_s, nodes.arrays, mean, F, Q, *ahead
         ):
             raise np.linalg.LinAlgError("process noise is not positive definite")
@@ -172,22 +178,20 @@ class Solver(Stateful):
                 else guesses
             )
             leaving = self._leaving(tracks, anchors) if self._has_final else None
-            given = (
-                tracks,
-                stamp_ns,
-                y,
-                H,
-                R,
-                guesses,
-                not stack.is_nonlinear,
-                self._thresholds,
-                anchors,
-                np.ascontiguousarray(stack.z, dtype=np.float64),
-                *nodes.noted_as(stack),
-            )
+            z = np.ascontiguousarray(stack.z, dtype=np.float64)
             while True:
-                flags = node_kernels.place(
-                    *given, nodes.arrays, nodes.seen, out, ahead_s
+                flags = insertion_kernels.place(
+                    tracks,
+                    stamp_ns,
+                    (*nodes.noted_as(stack), z, R),
+                    (y, H, guesses),
+                    not stack.is_nonlinear,
+                    self._thresholds,
+                    anchors,
+                    nodes.arrays,
+                    nodes.seen,
+                    out,
+                    ahead_s,
                 )
                 if flags != NO_ROOM:
                     break
@@ -279,7 +283,7 @@ class Solver(Stateful):
         nodes, far = self.nodes, np.empty(1, dtype=np.int64)
         for _ in range(max_iterations if len(tracks) else 0):
             starts = np.empty(len(tracks), dtype=np.int64)
-            num = node_kernels.move_far(
+            num = relinearisation_kernels.move_far(
                 tracks, self._thresholds, nodes.arrays, far, starts
             )
             if not num:
@@ -362,7 +366,7 @@ class Solver(Stateful):
                 for number, x in zip(nodes.window(track).tolist(), means, strict=True)
                 for factor in nodes.factors(number)
             )
-        total: float = node_kernels.measurement_cost(
+        total: float = linearisation_kernels.measurement_cost(
             compiled.kind,
             compiled.noise,
             track,
@@ -393,7 +397,7 @@ class Solver(Stateful):
         far = np.empty(nodes.stamps_ns.shape[1], dtype=np.int64)
         found = np.zeros(len(tracks), dtype=bool)
         if compiled is not None and not nodes.has_plugins:
-            node_kernels.overshot(
+            relinearisation_kernels.overshot(
                 compiled.kind,
                 compiled.noise,
                 tracks,
@@ -405,7 +409,9 @@ class Solver(Stateful):
             )
             return found
         for row, track in enumerate(tracks.tolist()):
-            num = node_kernels.find_far(track, self._thresholds, nodes.arrays, far)
+            num = relinearisation_kernels.find_far(
+                track, self._thresholds, nodes.arrays, far
+            )
             numbers = nodes.numbers[track, far[:num]].tolist()
             found[row] = any(
                 overshot(

@@ -10,9 +10,9 @@ import numpy as np
 from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
 from fgtrack.core.state import Snapshot
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.smoothing import node_kernels
+from fgtrack.estimation.smoothing import factor_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.kernels import CHANGED, KNOWN
+from fgtrack.estimation.smoothing.node_arrays import CHANGED, KNOWN
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -230,7 +230,9 @@ class IncrementalSolver(Solver):
         most = nodes.count[track] - start
         owners = np.empty((most, 3), dtype=np.int64)
         factors = np.empty((most, n + nodes.rows.shape[1], 2 * n + 1))
-        num = node_kernels.changed_factors(track, start, nodes.arrays, owners, factors)
+        num = factor_kernels.changed_factors(
+            track, start, nodes.arrays, owners, factors
+        )
         if num < 0:
             raise ValueError("process noise is not positive definite")
         changed: _Changed = {}
