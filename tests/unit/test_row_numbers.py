@@ -143,6 +143,18 @@ def test_a_row_number_beyond_an_end_is_refused(calls: Calls) -> None:
                 except IndexError:
                     continue
                 accepted.append(f"{key}: {name} {wrong}")
+        if "stack" in names:
+            place = names.index("stack")
+            codes, *others = arguments[place]
+            for wrong in (-3, 10**6, 2**40):
+                broken = codes.copy()
+                broken[-1] = wrong
+                tried += 1
+                try:
+                    function(*_with(arguments, place, (broken, *others)))
+                except IndexError:
+                    continue
+                accepted.append(f"{key}: components of a stack {wrong}")
     assert tried > 30
     assert not accepted
 
