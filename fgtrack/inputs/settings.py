@@ -160,7 +160,10 @@ class NuscenesInput:
     scene: str | None = None
     """Name or token of the scene if the results contain several: `scene-0061`."""
     tables: str | None = None
-    """Folder of the data set's tables, relative to the results file; by default `v1.0-...` next to the file."""
+    """Folder of the data set's tables, relative to the results file or to the working folder.
+
+    Null: `v1.0-...` next to the file.
+    """
     sensor: str = "detector"
     """Name of the sensor of the boxes."""
     classes: tuple[str, ...] = ("car",)

@@ -8,6 +8,8 @@ from pathlib import Path
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Message
+from fgtrack.inputs.errors import one_line
+from fgtrack.inputs.foreign import check_content, known_form
 from fgtrack.inputs.formats import ADAPTERS
 from fgtrack.inputs.receipts import with_right_receipts
 from fgtrack.inputs.settings import InputConfig
@@ -76,8 +78,13 @@ def input_kind(path: Path) -> str:
 
     Raises as `open_input`.
     """
-    if not path.exists():
-        raise CallError(f"{path}: there is no such file or folder")
+    try:
+        exists = path.exists()
+    except (OSError, RuntimeError) as error:  # a loop of symbolic links
+        raise DataError(f"{path}: cannot be opened ({one_line(error)})") from error
+    if not exists:
+        loop = ", the link leads nowhere or to itself" if path.is_symlink() else ""
+        raise CallError(f"{path}: there is no such file or folder{loop}")
     # Plug-ins are registered last and asked first. The built-in formats follow, the least specific ones at the end.
     names = [name for name in reversed(list(ADAPTERS)) if "/" not in name]
     try:
@@ -87,6 +94,7 @@ def input_kind(path: Path) -> str:
             )
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
+        check_content(path)
         # Formats are loaded as they are asked, because the reader of bags loads slowly.
         for name in names:
             form = file_format(name)
@@ -95,6 +103,8 @@ def input_kind(path: Path) -> str:
                     return name
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    if (known := known_form(path)) is not None:
+        raise DataError(f"{path}: {known}")
     formats_read = ", ".join(file_format(name).description for name in reversed(names))
     raise DataError(
         f"{path}: has a format that fgtrack does not read; it reads {formats_read}"

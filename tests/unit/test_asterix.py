@@ -8,6 +8,7 @@ gen = pytest.importorskip(
     "asterix.generated", reason="libasterix is not installed (extra `asterix`)"
 )
 
+from fgtrack.core.errors import DataError  # noqa: E402
 from fgtrack.inputs.errors import UntilBreak  # noqa: E402
 from fgtrack.inputs.formats.asterix_records import RecordReader  # noqa: E402
 from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin  # noqa: E402
@@ -287,3 +288,56 @@ def test_a_block_that_ends_inside_a_record_is_named(tmp_path):
     readable = UntilBreak(open_input(tmp_path / "a.ast").messages())
     assert len(list(readable)) == 1
     assert f"cannot decode category 10 at byte {len(whole)}" in str(readable.error)
+
+
+@pytest.mark.parametrize("ending", [".raw", ".asterix", ".bin"])
+def test_a_recording_is_recognised_by_its_blocks(tmp_path, ending):
+    content = b"".join(surface(50.0 + k, 100.0, 0.0) for k in range(5))
+    file = tmp_path / f"airport{ending}"
+    file.write_bytes(content)
+    assert input_kind(file) == input_kind(tmp_path) == "asterix"
+    assert len(lists(tmp_path)) == 5
+    file.write_bytes(bytes(range(256)) * 8)
+    with pytest.raises(DataError, match="has a format that fgtrack does not read"):
+        input_kind(file)
+
+
+@pytest.mark.parametrize("wrong_s", [3700.0, 30_000.0, -7200.0])
+@pytest.mark.parametrize("number", [0, 30, 59])
+def test_a_report_with_a_wrong_time_is_left_out_and_counted(tmp_path, wrong_s, number):
+    times = [40_000.0 + k for k in range(60)]
+    times[number] += wrong_s
+    (tmp_path / "a.ast").write_bytes(
+        b"".join(surface(time_s, 100.0 + k, 0.0) for k, time_s in enumerate(times))
+    )
+    read = lists(tmp_path)
+    kept = [each.stamp_ns // 10**9 - 40_000 for each in read]
+    assert kept == [k for k in range(60) if k != number]
+    assert all(each.receipt_ns == each.stamp_ns for each in read)
+    counted = [reason for each in read for reason in each.left_out]
+    assert counted == ["wrong time"]
+
+
+def test_a_wrong_transmission_time_delays_no_other_report(tmp_path):
+    reports = [
+        aircraft(40_000.0 + k, 40_000.5 + k + 5000.0 * (k == 20), 41.3, 2.08)
+        for k in range(60)
+    ]
+    (tmp_path / "a.ast").write_bytes(b"".join(reports))
+    read = lists(tmp_path)
+    assert len(read) == 59
+    assert {each.receipt_ns - each.stamp_ns for each in read} == {5 * 10**8}
+
+
+def test_times_continue_after_midnight_with_delays_of_either_sign(tmp_path):
+    reports = [
+        aircraft(
+            (86_390.0 + k) % 86_400, (86_390.0 + k + d) % 86_400, 41.3, 2.08, address=k
+        )
+        for k in range(20)
+        for d in [(-1 / 128, 0.0, 0.5)[k % 3]]
+    ]
+    (tmp_path / "a.ast").write_bytes(b"".join(reports))
+    read = lists(tmp_path)
+    assert [round(each.stamp_ns / 1e9) for each in read] == list(range(86_390, 86_410))
+    assert max(each.receipt_ns - each.stamp_ns for each in read) == 5 * 10**8

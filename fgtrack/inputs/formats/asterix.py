@@ -4,8 +4,9 @@ The specifications come from libasterix (extra `asterix`), which contains every 
 Times are seconds of the UTC day; a recording has no date. Category 021 has two times of
 a position, the stamp and the receipt. For the other categories the receipt is the
 newest stamp up to the record in its file, a lower bound. Records of one sensor with
-equal times make one list. Extrapolated positions (010, 020: bits CST of item 170) are
-no measurements and are left out.
+equal times make one list. Records with wrong times are left out and counted.
+Extrapolated positions (010, 020: bits CST of item 170) are no measurements and are left
+out.
 """
 
 import math
@@ -25,11 +26,14 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.inputs.errors import TruncatedInput, UntilBreak
 from fgtrack.inputs.formats.asterix_records import Record, RecordReader
+from fgtrack.inputs.formats.time_outliers import WRONG_TIME, with_outliers
+from fgtrack.inputs.formats.time_texts import on_nearest_day
 from fgtrack.inputs.geodetic import LocalPlane, warn_once
 from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin
 from fgtrack.inputs.source import FileFormat
 
-_DAY_NS = 86_400 * NS_PER_S
+#: A report that is so far behind its neighbours has a wrong time.
+_BEHIND_S = 3600.0
 _NM_M = 1852.0
 _FOOT_M = 0.3048
 #: Radius that contains 95 % of a circular Gaussian, in standard deviations.
@@ -101,6 +105,29 @@ class _Category(NamedTuple):
     """Least significant bits by item/part, where libasterix has wrong ones."""
 
 
+_ENDING = ".ast"
+#: Other endings of names in a folder; the content decides.
+_ENDINGS = (".raw", ".asterix", ".bin", ".dat", ".rec")
+#: Numbers of categories of the standard, and bytes of a file by which it is recognised.
+_NUMBERS = frozenset(
+    (
+        *range(1, 5),
+        *range(7, 12),
+        *range(15, 22),
+        23,
+        25,
+        32,
+        34,
+        48,
+        62,
+        63,
+        65,
+        240,
+        247,
+    )
+)
+_FEWEST_BLOCKS = 3
+_HEAD_BYTES = 1 << 16
 _WGS84 = ("041", "LAT", "LON")
 _CARTESIAN = ("042", "X", "Y")
 _POLAR = ("040", "RHO", "THETA")
@@ -147,9 +174,35 @@ _CATEGORIES = {
 
 
 def _recognises(path: Path) -> bool:
-    if path.is_dir():
-        return any(path.glob("*.ast"))
-    return path.suffix == ".ast"
+    return bool(_files(path)) if path.is_dir() else _is_recording(path)
+
+
+def _files(path: Path) -> list[Path]:
+    """Files at `path` with ASTERIX records, sorted by name."""
+    if not path.is_dir():
+        return [path]
+    usual = [each for each in path.iterdir() if each.suffix in (_ENDING, *_ENDINGS)]
+    return sorted(file for file in usual if file.is_file() and _is_recording(file))
+
+
+def _is_recording(file: Path) -> bool:
+    """True for the usual ending of the name, or for a file that is a chain of ASTERIX blocks."""
+    if file.suffix == _ENDING:
+        return True
+    if file.suffix not in _ENDINGS:
+        return False
+    with open_file(file) as blocks:
+        head = blocks.read(_HEAD_BYTES)
+    numbers = list[int]()
+    at = 0
+    while at + 3 <= len(head):
+        length = int.from_bytes(head[at + 1 : at + 3], "big")
+        if length <= 3 or head[at] not in _NUMBERS:
+            return False
+        numbers.append(head[at])
+        at += length
+    is_chain = at == len(head) or len(numbers) >= _FEWEST_BLOCKS
+    return is_chain and not _CATEGORIES.keys().isdisjoint(numbers)
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
@@ -164,7 +217,7 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     readers = {
         number: _reader(known[number], number, config.asterix) for number in _CATEGORIES
     }
-    files = sorted(path.glob("*.ast")) if path.is_dir() else [path]
+    files = _files(path)
     plane = LocalPlane(
         config.origin or next(iter(config.asterix.stations.values()), None)
     )
@@ -202,7 +255,7 @@ def _reader(
     )
 
 
-FORMAT = FileFormat("ASTERIX (.ast, or a folder of them)", _recognises, _open)
+FORMAT = FileFormat("ASTERIX (.ast, .raw, or a folder of them)", _recognises, _open)
 
 
 def _merged(
@@ -224,7 +277,9 @@ def _merged(
     ):
         lists = list(group)
         yield replace(
-            lists[0], objects=tuple(item for each in lists for item in each.objects)
+            lists[0],
+            objects=tuple(item for each in lists for item in each.objects),
+            left_out=tuple(reason for each in lists for reason in each.left_out),
         )
     unknown = [f"{number:g}" for number, site in sites.items() if site.misplaces]
     if len(unknown) > 1:
@@ -247,7 +302,54 @@ def _reports(
 
     Stations without a configured position are added to `sites`, by SIC.
     """
+    readable = UntilBreak(_timed(file, readers, given))
     newest_ns: int | None = None
+    left_out: list[str] = []
+    last: DetectionList | None = None
+    checked = with_outliers(
+        readable, lambda each: max(each.stamp_ns, each.receipt_ns) * 1e-9, _BEHIND_S
+    )
+    for (number, record, stamp_ns, receipt_ns), is_wrong in checked:
+        if is_wrong:
+            left_out.append(WRONG_TIME)
+            continue
+        category = _CATEGORIES[number]
+        station = record.get("010/SIC", 0.0)
+        if station not in sites:
+            sites[station] = _Site(plane, None)
+        item = _detection(record, number, category, sites[station], plane)
+        if item is None:
+            continue
+        newest_ns = receipt_ns if newest_ns is None else max(newest_ns, receipt_ns)
+        sensor = category.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
+        at = sensor, stamp_ns, newest_ns
+        counted = tuple(left_out)
+        left_out = []
+        last = DetectionList(*at, (item,), "map", counted, plane.origin_deg)
+        yield last
+    if left_out and last is not None:
+        yield replace(last, objects=(), left_out=tuple(left_out))
+    readable.raise_error()
+
+
+class _Timed(NamedTuple):
+    """A target report and its times."""
+
+    category: int
+    record: Record
+    stamp_ns: int
+    receipt_ns: int
+
+
+def _timed(
+    file: Path, readers: Mapping[int, RecordReader], given: AsterixInput
+) -> Iterator[_Timed]:
+    """Yield the target reports of `file` that have a stamp and are measured, in the order of the file.
+
+    A time of day is set on the day nearest to the report before, and the receipt on the
+    day nearest to the stamp: it may lie before the stamp, because both are rounded.
+    """
+    before_ns: int | None = None
     for number, record in _records(file, readers):
         category = _CATEGORIES[number]
         if number == 10 and record.get("000") != _TARGET_REPORT:
@@ -261,35 +363,14 @@ def _reports(
         )
         if stamp_s is None or (number in (10, 20) and record.get("170/CST")):
             continue
-        station = record.get("010/SIC", 0.0)
-        if station not in sites:
-            sites[station] = _Site(plane, None)
-        item = _detection(record, number, category, sites[station], plane)
-        if item is None:
-            continue
-        stamp_ns = _on_nearest_day(stamp_s, newest_ns)
-        receipt_ns = (
-            stamp_ns if receipt_s is None else _on_nearest_day(receipt_s, stamp_ns)
-        )
-        newest_ns = receipt_ns if newest_ns is None else max(newest_ns, receipt_ns)
-        sensor = category.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
-        yield DetectionList(
-            sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg
-        )
-
-
-def _on_nearest_day(time_s: float, near_ns: int | None) -> int:
-    """Return a time of day as a stamp on the day nearest to `near_ns`; on day 0 if `near_ns` is None.
-
-    The second time of a report may lie before the first, because both are rounded to
-    1/128 s.
-    """
-    time_ns = round(time_s * NS_PER_S)
-    return (
-        time_ns
-        if near_ns is None
-        else time_ns + _DAY_NS * round((near_ns - time_ns) / _DAY_NS)
-    )
+        stamp_ns = round(stamp_s * NS_PER_S)
+        if before_ns is not None:
+            stamp_ns = on_nearest_day(stamp_ns, before_ns)
+        receipt_ns = stamp_ns
+        if receipt_s is not None:
+            receipt_ns = on_nearest_day(round(receipt_s * NS_PER_S), stamp_ns)
+        before_ns = stamp_ns
+        yield _Timed(number, record, stamp_ns, receipt_ns)
 
 
 def _records(

@@ -35,6 +35,7 @@ from fgtrack.inputs.formats.nmea_times import (
     log_times,
     split_line,
 )
+from fgtrack.inputs.formats.time_outliers import WRONG_TIME
 from fgtrack.inputs.geodetic import LocalPlane
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.source import FileFormat
@@ -61,7 +62,6 @@ _NO_COURSE_DEG = 360.0
 _MOVING_MPS = 0.5
 #: Reasons for which a report is left out.
 _CHECKSUM = "wrong checksum"
-_TIME = "wrong time"
 _DAMAGED = "damaged payload"
 _NO_POSITION = "missing position"
 
@@ -130,7 +130,7 @@ class _Sentences:
                 self._left_out.append(_CHECKSUM)
                 continue
             if self._times.is_wrong[number]:
-                self._left_out.append(_TIME)
+                self._left_out.append(WRONG_TIME)
                 continue
             self.received_s = float(self._times.received_s[number])
             self.arrived_s = float(self._times.arrived_s[number])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.inputs.formats.time_outliers import outliers
 from fgtrack.inputs.formats.time_texts import DAY_S, time_in_line_s
 
 _LINE = re.compile(
@@ -23,13 +24,6 @@ _GNSS_TIME = re.compile(rb"\$..(RMC|ZDA|GLL|GGA),(.*)")
 _WRAPPER = b"$PGHP,"
 #: Numbers of tag blocks above this are milliseconds.
 _LARGEST_S = 1e11
-#: Times are compared with this number of neighbours, of which some on both sides of the range may be wrong too.
-_NEIGHBOURS = 20
-_WRONG = 2
-#: A time is wrong if it differs from the range of its neighbours by this number of ranges, and by so many s besides.
-_RANGES = 5.0
-_AHEAD_S = 60.0
-_BEHIND_S = float(DAY_S)
 
 
 class Line(NamedTuple):
@@ -173,30 +167,6 @@ def log_times(lines: Iterable[bytes]) -> LogTimes | None:
     logged_s[outliers(logged_s)] = np.nan
     arrived_s = _newest(np.where(np.isnan(logged_s), sound_s, logged_s))
     return LogTimes(received_s, arrived_s, is_wrong)
-
-
-def outliers(times_s: FloatArray) -> BoolArray:
-    """Return, for each of the times, shape (n,), True if it does not fit its neighbours; NaN is no time.
-
-    A time is wrong if it is far ahead of its neighbours, compared with the range of the
-    neighbours' times, or a day behind them. Late lines of a satellite are behind, and
-    not wrong.
-    """
-    present = np.flatnonzero(~np.isnan(times_s))
-    is_wrong = np.zeros(len(times_s), dtype=bool)
-    num_near = min(_NEIGHBOURS + 1, len(present))
-    if num_near < 2 * _WRONG + 2:
-        return is_wrong
-    values_s = times_s[present]
-    windows_s = np.sort(np.lib.stride_tricks.sliding_window_view(values_s, num_near))
-    first = np.clip(np.arange(len(present)) - num_near // 2, 0, len(windows_s) - 1)
-    low_s = windows_s[first, _WRONG]
-    high_s = windows_s[first, -1 - _WRONG]
-    margin_s = _RANGES * (high_s - low_s)
-    is_wrong[present] = (values_s > high_s + margin_s + _AHEAD_S) | (
-        values_s < low_s - margin_s - _BEHIND_S
-    )
-    return is_wrong
 
 
 def _newest(times_s: FloatArray) -> FloatArray:

@@ -86,16 +86,20 @@ def _results(file: Path) -> Iterator[tuple[str, Json]]:
 
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
-    folders = sorted(each.parent for each in file.parent.glob("v1.0-*/ego_pose.json"))
-    if settings.tables is not None:
-        folder = file.parent / settings.tables
+    """Folder of the tables; the results file, or the link to it, may be anywhere. Raises `CallError`."""
+    beside = [file.parent, file.resolve().parent]
+    given = settings.tables
+    if given is not None:
+        folders = [each / given for each in (*beside, Path())]
     else:
-        folder = folders[0] if len(folders) == 1 else file.parent
-    if not (folder / "ego_pose.json").is_file():
-        raise CallError(
-            f"{file}: no folder with ego_pose.json is next to the file, name the folder as input.nuscenes.tables"
-        )
-    return folder
+        found = {each.parent for each in beside[1].glob("v1.0-*/ego_pose.json")}
+        folders = [*(found if len(found) == 1 else ()), *beside]
+    for folder in folders:
+        if (folder / "ego_pose.json").is_file():
+            return folder
+    raise CallError(
+        f"{file}: no folder with ego_pose.json is next to the file, name the folder as input.nuscenes.tables"
+    )
 
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:

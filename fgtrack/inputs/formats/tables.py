@@ -49,14 +49,13 @@ from fgtrack.inputs.formats.table_times import (
     TableTimes,
     WrongTimeError,
 )
+from fgtrack.inputs.formats.time_outliers import WRONG_TIME
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane, warn_once
 from fgtrack.inputs.settings import CsvTable, InputConfig
 from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
 
 _ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
-WRONG_TIME = "wrong time"
-"""Reason for which rows are left out."""
 #: Rows from which the form of dates is inferred.
 _SAMPLES = 1000
 #: Bytes from which the form of the text is inferred.

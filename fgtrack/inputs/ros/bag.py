@@ -57,7 +57,12 @@ class Bag:
                 (item for file in files for item in file.connections),
                 key=_topic_and_type,
             )
-            self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
+            of_ros1 = [isinstance(file, Rosbag1File) for file in files]
+            self._ros1 = any(of_ros1)
+            if self._ros1 and not all(of_ros1):
+                raise DataError(
+                    f"{self.path}: contains bags of ROS 1 and of ROS 2, give one of the files"
+                )
             self.break_off = self._break_off(files)
         for item in connections:
             if (kind := getattr(item.ext, "serialization_format", "cdr")) != "cdr":

@@ -3,7 +3,7 @@
 import filecmp
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -26,6 +26,7 @@ METADATA = "metadata.yaml"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SETTINGS = "fgtrack"
 """Entry of the metadata's custom data with configuration keys and values that the recording carries, as JSON."""
+_ENDINGS = frozenset((".mcap", ".db3", ".bag"))
 _READERS: Mapping[bytes, type[BagFile]] = {
     MCAP_MAGIC: McapFile,
     b"SQLite format 3\x00": Sqlite3File,
@@ -51,7 +52,7 @@ def files_of(path: Path) -> list[Path]:
     """Return the files of the recording at `path`.
 
     They are the file itself, the files in the folder's metadata.yaml, or all bag files
-    in the folder.
+    in the folder, if there is no metadata.yaml or a file in it has another name now.
     """
     files = [path]
     if (path / METADATA).is_file():
@@ -59,8 +60,8 @@ def files_of(path: Path) -> list[Path]:
             path / PurePath(name).name
             for name in _metadata(path)["relative_file_paths"]
         ]
-    elif path.is_dir():
-        files = bags_in(path)
+    if path.is_dir() and (files == [path] or not all(map(Path.exists, files))):
+        files = bags_in(path) or files
     for first, other in combinations(files, 2):
         if first.stat().st_size and filecmp.cmp(first, other, shallow=False):
             raise DataError(
@@ -80,8 +81,12 @@ def settings_of(path: Path) -> Any:  # Any: validated by `fgtrack.config.recorde
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the `.mcap` and `.db3` files of a folder, sorted by name."""
-    return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    """Return the bag files of a folder, also compressed ones and those of ROS 1, sorted by name."""
+    return sorted(
+        file
+        for file in path.iterdir()
+        if _ENDINGS & set(file.suffixes[-2:]) and file.is_file()
+    )
 
 
 def _metadata(path: Path) -> Any:  # Any: YAML values, checked by the caller
@@ -91,9 +96,17 @@ def _metadata(path: Path) -> Any:  # Any: YAML values, checked by the caller
 
 
 def storage_of(path: Path) -> type[BagFile] | None:
-    """Return the reader class for the file `path`, recognised by its first bytes; None for other files."""
+    """Return the reader class for the file `path`, recognised by its first bytes; None for other files.
+
+    The bytes of a zstd file are decompressed first.
+    """
+    size = max(map(len, _READERS))
     with open_file(path) as file:
-        start = file.read(max(map(len, _READERS)))
+        start = file.read(size)
+        if start.startswith(ZSTD_MAGIC):
+            file.seek(0)
+            with suppress(zstandard.ZstdError):
+                start = zstandard.ZstdDecompressor().stream_reader(file).read(size)
     return next(
         (kind for magic, kind in _READERS.items() if start.startswith(magic)), None
     )
