@@ -24,9 +24,11 @@ _HOMES = {
     "Checkpoint": "fgtrack.pipeline.live",
     "Config": "fgtrack.config.settings",
     "DataError": "fgtrack.core.errors",
+    "Decision": "fgtrack.meaning.decision",
     "Detection": "fgtrack.core.types",
     "DetectionList": "fgtrack.core.types",
     "Disposition": "fgtrack.core.types",
+    "Draft": "fgtrack.meaning.draft",
     "EgoState": "fgtrack.core.types",
     "Estimator": "fgtrack.estimation.base",
     "FgtrackError": "fgtrack.core.errors",
@@ -72,6 +74,7 @@ _HOMES = {
     "close_ups": "fgtrack.show.figures.late_detection",
     "compare": "fgtrack.evaluation.tables.compare",
     "config": "fgtrack",
+    "draft": "fgtrack.meaning.public",
     "estimate_offsets": "fgtrack.clocks.offsets",
     "estimator": "fgtrack.estimation.registry",
     "estimator_claims": "fgtrack.estimation.registry",
@@ -175,6 +178,9 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.inputs.recording import write_recording as write_recording
     from fgtrack.inputs.source import FileFormat as FileFormat
     from fgtrack.inputs.source import open_input as open_input
+    from fgtrack.meaning.decision import Decision as Decision
+    from fgtrack.meaning.draft import Draft as Draft
+    from fgtrack.meaning.public import draft as draft
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel
     from fgtrack.models.measurement import SensorPose as SensorPose
     from fgtrack.models.measurement import measured_position as measured_position

@@ -146,7 +146,7 @@ class Study:
     summary: tuple[str, ...]
     """About five sentences: the recording, the tracks, the best estimator, the noise, a recommendation."""
     assumptions: tuple[str, ...] = field(repr=False)
-    """Settings that come neither from the configuration nor from the advice: a line per sensor with the reasons."""
+    """Decisions and assumptions with their certainty and reasons; open questions come first."""
     advice: Advice | None = field(repr=False)
     """The advice; None if it was not requested, or nothing could be assessed."""
     runs: tuple[Run, ...] = field(repr=False)
@@ -155,6 +155,10 @@ class Study:
     """Comparison of the runs."""
     broken: str | None
     """Reason why the recording could be read only in part, or None."""
+    problem: str | None = None
+    """Line on the questions that must be answered before all sensors are used, or None."""
+    questions: tuple[str, ...] = field(default=(), repr=False)
+    """Questions that the recording does not answer, a line each with the key to set."""
 
     @property
     def report(self) -> Path:
@@ -192,6 +196,9 @@ def study(
     settings of `fgtrack.advise` are adopted. `figures` are additional figures by name.
     `overwrite` replaces a study in `out`. `on_step` is called with the name of each
     step and the finished share of the work.
+
+    A recording without a configuration is drafted as by `fgtrack.draft`. A sensor whose
+    question stays open is left out of the runs; `study.problem` names it.
 
     Raises `CallError` for an invalid configuration or `out`. Raises `DataError` if the
     recording cannot be read, or contains nothing to track.
@@ -307,6 +314,8 @@ def study(
         result,
         tables,
         result[0].meta["broken_off"],
+        draft.problem,
+        draft.questions,
     )
 
 

@@ -207,7 +207,7 @@ def motion_models_page() -> str:
 
 
 _GROUPS = {
-    "Recordings, runs, live use": ("inputs", "runs", "pipeline", "config", "sim"),
+    "Recordings, runs, live use": ("inputs", "meaning", "runs", "pipeline", "config", "sim"),
     "Evaluation, figures, reports": ("evaluation", "show", "recording_study"),
     "Advice and noise": ("advice", "noise", "clocks"),
     "Messages, reports, errors": ("core",),

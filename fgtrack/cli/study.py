@@ -1,16 +1,16 @@
 """`fgtrack study` and `demo`: from a recording, or a simulated race, to a report in one command."""
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from typer import Option
+from typer import Argument, Option
 
 from fgtrack.cli.arguments import (
     ConfigFile,
-    Input,
     Overwrite,
     PitMap,
     Seed,
@@ -20,9 +20,15 @@ from fgtrack.cli.arguments import (
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
-from fgtrack.core.errors import DataError
+from fgtrack.config.settings import Config
+from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.output import check_no_overlap, locked_folder
-from fgtrack.evaluation.diagnostics import diagnostics
+from fgtrack.evaluation.diagnostics import (
+    diagnostics,
+    received_nothing,
+    repeated,
+    unused,
+)
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import with_origin
@@ -33,10 +39,20 @@ from fgtrack.sim.simulate import simulate
 
 
 def study(
-    recording: Input,
+    recordings: Annotated[
+        list[Path],
+        Argument(
+            metavar="INPUT...",
+            help="Recordings of one vehicle: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
+        ),
+    ],
     out: Annotated[
         Path,
-        Option("-o", "--out", help="Folder for report, settings, runs and figures."),
+        Option(
+            "-o",
+            "--out",
+            help="Folder for report, settings, runs and figures; several recordings: one subfolder for each.",
+        ),
     ],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,
@@ -44,16 +60,18 @@ def study(
     settings: Settings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Advise, replay with three estimators, compare, report.
+    """Find out what a recording means, replay it with three estimators, compare, report.
 
     No configuration is needed. Assumptions are printed with their reasons, and written
-    to settings.yaml. Change this file and run the command again.
+    to settings.yaml. Change this file and run the command again. The settings hold for
+    other recordings of the vehicle.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
-    for path in outputs(out):
-        check_no_overlap(path, [recording, config_file])
-    with progress("study") as tell:
-        result = studied(recording, out, config, overwrite=overwrite, on_step=tell)
+    if len(recordings) > 1:
+        _study_each(recordings, out, config, config_file, overwrite)
+        return
+    [recording] = recordings
+    result = _studied(recording, out, config, config_file, overwrite)
     for line in dict.fromkeys(
         str(item) for run in result.runs for item in diagnostics(run)
     ):
@@ -61,21 +79,90 @@ def study(
     show_study(result, recording)
 
 
+def _studied(
+    recording: Path,
+    out: Path,
+    config: Config,
+    config_file: str | None,
+    overwrite: bool,
+) -> Study:
+    for path in outputs(out):
+        check_no_overlap(path, [recording, config_file])
+    with progress("study") as tell:
+        return studied(recording, out, config, overwrite=overwrite, on_step=tell)
+
+
+def _study_each(
+    recordings: Sequence[Path],
+    out: Path,
+    config: Config,
+    config_file: str | None,
+    overwrite: bool,
+) -> None:
+    """Study each recording in its own folder, and print a line for each.
+
+    Raises `DataError` at the end if a recording has an error or an open question.
+    """
+    failed = 0
+    for recording, folder in zip(recordings, _folders(recordings, out), strict=True):
+        try:
+            found = _studied(recording, folder, config, config_file, overwrite)
+            problem = _problem(found, recording)
+            line = f"{folder.name}: {found.report}; {found.summary[1]}"
+        except FgtrackError as error:
+            problem = str(error)
+            line = f"{folder.name}: no study"
+        failed += problem is not None
+        say(f"{line}{'' if problem is None else f' error: {problem}'}")
+    if failed:
+        raise DataError(
+            f"{failed} of {len(recordings)} recordings have an error or an open question"
+        )
+
+
+def _folders(recordings: Sequence[Path], out: Path) -> list[Path]:
+    """Return a folder in `out` for each recording: its name, with the ending if names are equal otherwise."""
+    stems = [
+        path.name if path.is_dir() else path.name.split(".")[0] for path in recordings
+    ]
+    names = [
+        stem if stems.count(stem) == 1 else path.name
+        for path, stem in zip(recordings, stems, strict=True)
+    ]
+    if len(set(names)) < len(names):
+        raise CallError("two recordings have the same name: study them one by one")
+    return [out / name for name in names]
+
+
 def show_study(found: Study, recording: Path) -> None:
-    """Print a study; raises `DataError` if the recording breaks off."""
+    """Print a study; raises `DataError` if the recording breaks off, has an open question, or no used detection."""
+    for assumption in found.assumptions:
+        say(assumption)
+    say("")
     sentences(found.summary)
     show(replace(found.tables, verdict=()), None)
     say("")
-    for assumption in found.assumptions:
-        say(assumption)
     again = shlex.join(
         ["fgtrack", "study", str(recording), "-c", str(found.settings), "-o", "OTHER"]
     )
     say(f"settings: {found.settings}; change the file and run `{again}`")
     say(f"report: {found.report}, open the file in a browser")
+    if (problem := _problem(found, recording)) is not None:
+        raise DataError(problem)
+
+
+def _problem(found: Study, recording: Path) -> str | None:
+    """Return the reason for the exit code 1, or None."""
     if found.broken is not None:
         problem = with_origin(found.broken, str(recording))
-        raise DataError(f"{problem}; the messages before are used")
+        return f"{problem}; the messages before are used"
+    run = found.runs[0]
+    loop = repeated(run)
+    reason = received_nothing(run) or unused(run)
+    if reason is None and loop is not None:
+        reason = loop.text
+    reason = reason or found.problem
+    return None if reason is None else f"{recording}: {reason}"
 
 
 def demo(

@@ -37,7 +37,7 @@ class ReportHead:
     sentences: Sequence[str] = ()
     """Verdict of the report; if empty, the verdict of the comparison."""
     assumptions: Sequence[str] = ()
-    """Settings that the user has not given."""
+    """Decisions and assumptions about settings that the user has not given; they come first."""
     advice: Sequence[str] = ()
     """Sentences of the advice."""
     moment: Moment | None = None
@@ -94,13 +94,13 @@ def _page(
     nothing = "<p>Nothing to evaluate: no errors against truth and no innovations.</p>"
     shown = [table for table in tables.in_full().tables.values() if table.records]
     open_parts = {
+        "Assumptions": _list(head.assumptions),
         "Verdict": _list(head.sentences or tables.verdict) or nothing,
         "Warnings": few + _folded("More warnings", more),
         "Viewer": _template("viewer.html"),
         "Figures": _figures(text for name, text in figures.items() if name in first),
     }
     folded_parts = {
-        "Assumptions": _list(head.assumptions),
         "Advice": _list(head.advice),
         "Tables": "".join(
             _wide(one.title, one.to_html()) + _list(one.notes, "soft") for one in shown
