@@ -116,8 +116,13 @@ def assumed(config: Config, source: InputSource) -> Assumed:
 
 def is_open(config: Config) -> bool:
     """True if `assumed` reads the messages: no sensors are given, or a sensor lacks noise or limits of view."""
-    return not config.sensors or not all(
-        sensor.std and sensor.has_view_limits for sensor in config.used_sensors.values()
+    mapped = {*config.input.detections, *config.input.csv.detections}
+    named = {*mapped, *config.sensors}.difference(config.ignore_sensors)
+    return not named or any(
+        name not in config.sensors
+        or not config.sensors[name].std
+        or not config.sensors[name].has_view_limits
+        for name in named
     )
 
 
