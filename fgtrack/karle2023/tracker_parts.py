@@ -122,13 +122,11 @@ class SlotInbox(Inbox):
 
     STATE: ClassVar[tuple[str, ...]] = (
         *Inbox.STATE,
-        "_slots",
         "_last_stamp_ns",
     )
 
     def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
         super().__init__(sensors)
-        self._slots: dict[str, Batch] = {}
         self._last_stamp_ns: dict[str, int] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
@@ -140,14 +138,12 @@ class SlotInbox(Inbox):
             else message.stamp_ns
         )
         if self._last_stamp_ns.get(message.sensor) == stamp_ns:
-            return self._superseded(message.sensor) + records(
-                message, Disposition.DUPLICATE
-            )
+            return self._note(message, records(message, Disposition.DUPLICATE), [])
         delay_ns = message.receipt_ns - stamp_ns
         if sensor.max_delay_s is not None and delay_ns > nanoseconds(
             sensor.max_delay_s
         ):
-            return records(message, Disposition.TOO_OLD)
+            return self._note(message, records(message, Disposition.TOO_OLD), None)
         kept = []
         ended = []
         broken = False
@@ -162,28 +158,47 @@ class SlotInbox(Inbox):
             else:
                 broken = True
                 ended.append(record(message, index, Disposition.INVALID))
-        superseded = self._superseded(message.sensor)
-        if kept or not broken:
-            self._slots[message.sensor] = Batch(message, stamp_ns, tuple(kept))
-            self._last_stamp_ns[message.sensor] = stamp_ns
-        return superseded + ended
+        if broken and not kept:
+            return self._note(message, ended, [])
+        return self._note(message, ended, [Batch(message, stamp_ns, tuple(kept))])
 
-    def _superseded(self, sensor: str) -> list[UpdateRecord]:
-        batch = self._slots.pop(sensor, None)
-        if batch is None:
-            return []
-        return [
-            record(batch.message, index, Disposition.SUPERSEDED)
-            for index in batch.indices
-        ]
+    def _note(
+        self,
+        message: DetectionList,
+        ended: list[UpdateRecord],
+        slot: list[Batch] | None,
+    ) -> list[UpdateRecord]:
+        """Note what becomes of `message`: the batch in the `slot` of its sensor from now on; None for no change."""
+        pending, last_ns = self.pending, self._last_stamp_ns
+        if slot is not None:
+            former = [each for each in pending if each.message.sensor == message.sensor]
+            ended = [
+                record(batch.message, index, Disposition.SUPERSEDED)
+                for batch in former
+                for index in batch.indices
+            ] + ended
+            others = [each for each in pending if each.message.sensor != message.sensor]
+            pending = others + slot
+        for batch in slot or ():
+            last_ns = {**last_ns, message.sensor: batch.stamp_ns}
+        all_ended = [*self.ended, ended]
+        self.pending, self.ended, self._last_stamp_ns, self.received = (
+            pending,
+            all_ended,
+            last_ns,
+            message,
+        )
+        return ended
 
-    def collect(
+    def due(
         self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
-    ) -> list[Batch]:
-        """See `Inbox.collect`; equal stamps keep the order of the sensors, and no batch waits."""
-        batches = [self._slots[name] for name in self._sensors if name in self._slots]
-        self._slots = {}
-        return sorted(batches, key=lambda batch: batch.stamp_ns)
+    ) -> tuple[list[Batch], list[Batch]]:
+        """See `Inbox.due`; equal stamps keep the order of the sensors, and no batch waits."""
+        order = list(self._sensors)
+        return sorted(
+            self.pending,
+            key=lambda batch: (batch.stamp_ns, order.index(batch.message.sensor)),
+        ), []
 
 
 def _float_stamp(message: DetectionList) -> int:

@@ -143,11 +143,11 @@ class Tracker:
         "_refused",
         "_unknown",
         "_records",
-        "_uncounted",
         "_counts",
         "_last",
         "_first_tick_ns",
         "_ready",
+        "_due",
         "_ticks_ns",
         "_node",
         "_skipped",
@@ -175,13 +175,16 @@ class Tracker:
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
-        self._uncounted: TickReport | None = None  # report of an interrupted tick
         self._counts: dict[str, Counter[str]] = {}
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
-        self._arrivals: deque[EgoState | DetectionList] = deque()
+        # Each message is in a tuple of its own, so that two receipts of one object differ.
+        self._arrivals: deque[tuple[EgoState | DetectionList]] = deque()
+        self._taken: tuple[object] | None = None  # the newest arrival that was taken
         # Validated messages for the next tick.
-        self._ready: deque[EgoState | DetectionList] = deque()
+        self._ready: list[EgoState | DetectionList] = []
+        # Those of this tick with corrected times; an interrupt leaves some for the next one.
+        self._due: list[EgoState | DetectionList] = []
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
         self._node = Node(
             None if config.clock.node_hz is None else period_ns(config.clock.node_hz)
@@ -311,60 +314,73 @@ class Tracker:
         Detections of an unknown sensor become `invalid` at the next tick. A receipt
         more than a minute ahead of this tick is replaced by the time of the tick.
         """
-        self._arrivals.append(message)
+        self._arrivals.append((message,))
 
     def _take_arrivals(self) -> None:
-        """Validate all received messages, and keep the valid ones for the next tick."""
+        """Validate all received messages, and keep the valid ones for the next tick.
+
+        An interrupt loses no message and takes none twice: one statement notes the outcome and the arrival.
+        """
         for _ in range(len(self._arrivals)):  # messages that arrive meanwhile may wait
-            message = self._arrivals[
-                0
-            ]  # removed below, so an interrupt does not lose it
-            try:
-                self._take(message)
-            except InvalidMessageError as error:
-                kind = (
-                    "object list" if isinstance(message, DetectionList) else "ego state"
-                )
-                self._refuse(message, f"{kind}: {_rule(error)}")
-            except Exception as error:
-                self._refuse(
-                    message, f"message cannot be read ({type(error).__name__})"
+            arrival = self._arrivals[0]
+            if arrival is not self._taken:
+                ready, refused = self._validated(arrival[0])
+                all_ready, all_records = [*self._ready, *ready], self._records + refused
+                self._ready, self._records, self._taken = (
+                    all_ready,
+                    all_records,
+                    arrival,
                 )
             self._arrivals.popleft()
 
-    def _refuse(self, message: EgoState | DetectionList, reason: str) -> None:
-        """Count a message that is not used, and record its detections as invalid."""
-        self._refused[reason] += 1
-        if isinstance(message, DetectionList):
-            sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
-            times_ns = _recorded_ns(message.stamp_ns), _recorded_ns(message.receipt_ns)
-            rows = range(len(message.objects))
-            self._records += [
-                UpdateRecord(sensor, *times_ns, row, Disposition.INVALID)
-                for row in rows
-            ]
+    def _validated(
+        self, message: EgoState | DetectionList
+    ) -> tuple[list[EgoState | DetectionList], list[UpdateRecord]]:
+        """Return the valid message, if it is one, and the records of its detections if it is refused."""
+        try:
+            return self._valid(message), []
+        except InvalidMessageError as error:
+            is_list = isinstance(message, DetectionList)
+            kind = "object list" if is_list else "ego state"
+            return [], self._refused_records(message, f"{kind}: {_rule(error)}")
+        except _RefusedError as error:
+            return [], self._refused_records(message, str(error))
+        except Exception as error:
+            return [], self._refused_records(message, _unreadable(error))
 
-    def _take(self, message: EgoState | DetectionList) -> None:
+    def _refused_records(
+        self, message: EgoState | DetectionList, reason: str
+    ) -> list[UpdateRecord]:
+        """Count a message that is not used; return the records of its detections, which are invalid."""
+        self._refused[reason] += 1
+        if not isinstance(message, DetectionList):
+            return []
+        sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
+        times_ns = _recorded_ns(message.stamp_ns), _recorded_ns(message.receipt_ns)
+        return [
+            UpdateRecord(sensor, *times_ns, row, Disposition.INVALID)
+            for row in range(len(message.objects))
+        ]
+
+    def _valid(
+        self, message: EgoState | DetectionList
+    ) -> list[EgoState | DetectionList]:
+        """Return the valid message; nothing of an ignored sensor. Raises for other messages."""
         if not isinstance(message, EgoState | DetectionList):
-            self._refused["neither ego state nor object list"] += 1
-            return
+            raise _RefusedError("neither ego state nor object list")
         message = validated_head(message)
         for name in ("stamp_ns", "receipt_ns"):
             if not 0 <= getattr(message, name) <= LARGEST_NS:
                 raise InvalidMessageError(f"{name}: nanoseconds since 1970 expected")
-        if isinstance(message, DetectionList):
-            sensor = message.sensor
-            if sensor not in self.config.sensors:
-                if sensor not in self.config.ignore_sensors:
-                    self._refuse(
-                        message,
-                        f"sensor {self._name_for_counts(sensor)!r} has no model",
-                    )
-                return
-            message = replace(
-                message, objects=tuple(map(self._validated, message.objects))
-            )
-        self._ready.append(message)
+        if isinstance(message, EgoState):
+            return [message]
+        if message.sensor not in self.config.sensors:
+            if message.sensor in self.config.ignore_sensors:
+                return []
+            name = self._name_for_counts(message.sensor)
+            raise _RefusedError(f"sensor {name!r} has no model")
+        objects = tuple(map(self._valid_detection, message.objects))
+        return [replace(message, objects=objects)]
 
     def _deliver(self, now_ns: int) -> None:
         """Pass all valid messages to the tracker; none may be received after the tick at `now_ns`.
@@ -373,21 +389,39 @@ class Tracker:
         time of the tick. Otherwise this message would count as recent, and later
         messages as old, until the clock reaches the receipt.
         """
-        while self._ready:
-            message = self._ready[0]  # removed below, so an interrupt does not lose it
-            if message.receipt_ns - now_ns > MOST_AHEAD_NS:
-                message = replace(message, receipt_ns=now_ns)
+        due, records = self._due.copy(), self._records.copy()
+        for message in self._ready:
             try:
-                if isinstance(message, DetectionList):
-                    message = corrected(message, self.config.sensors)
-                    if message.frame != "map":
-                        self._need_ego[message.sensor] = None
-                self._tracker.receive(message)
+                due.append(self._corrected(message, now_ns))
             except Exception as error:
-                self._refuse(
-                    message, f"message cannot be read ({type(error).__name__})"
-                )
-            self._ready.popleft()
+                records += self._refused_records(message, _unreadable(error))
+        self._ready, self._due, self._records = [], due, records
+        tracker = self._tracker
+        # An interrupt may have left messages here that the tracker has received.
+        received = [row for row, each in enumerate(due) if each is tracker.received]
+        for message in due[received[-1] + 1 :] if received else due:
+            try:
+                tracker.receive(message)
+            except Exception as error:
+                refused = self._refused_records(message, _unreadable(error))
+                records = self._records + refused
+                self._records, tracker.received = records, message
+        self._due = []
+
+    def _corrected(
+        self, message: EgoState | DetectionList, now_ns: int
+    ) -> EgoState | DetectionList:
+        """Return a copy of a message with corrected times."""
+        is_ahead = message.receipt_ns - now_ns > MOST_AHEAD_NS
+        message = replace(
+            message, receipt_ns=now_ns if is_ahead else message.receipt_ns
+        )
+        if isinstance(message, EgoState):
+            return message
+        message = corrected(message, self.config.sensors)
+        if message.frame != "map":
+            self._need_ego[message.sensor] = None
+        return message
 
     def _name_for_counts(self, sensor: str) -> str:
         """Return the name under which a sensor is counted: unknown sensors beyond the first 100 share a name."""
@@ -398,7 +432,7 @@ class Tracker:
         self._unknown[sensor] = None
         return sensor
 
-    def _validated(self, item: Detection) -> Detection:
+    def _valid_detection(self, item: Detection) -> Detection:
         """Return `item` with plain values; a detection without values if it has wrong types."""
         try:
             return validated_detection(item)
@@ -420,19 +454,12 @@ class Tracker:
             begun_ns = perf_counter_ns()
             self._take_arrivals()
             self._deliver(now_ns)
-            if self._uncounted is not None:
-                self._records += self._uncounted.updates
-            self._uncounted = report = self._tracker.tick(now_ns)
+            self._read_report()
+            report = self._tracker.tick(now_ns)
             report = replace(report, updates=(*self._records, *report.updates))
-            counts = Counter(
-                (update.sensor, str(update.disposition)) for update in report.updates
-            )
-            # A single statement, so that an interrupt comes before or after it.
-            self._counts, self._records, self._uncounted = (
-                self._counts_plus(counts),
-                [],
-                None,
-            )
+            counts = self._counts_plus(report.updates)
+            # One statement, so that an interrupt comes before or after it.
+            self._counts, self._records, self._tracker.unread = counts, [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
             if self._last.tick < 0:
@@ -443,6 +470,13 @@ class Tracker:
                 )
             self._last = report
             return report
+
+    def _read_report(self) -> None:
+        """Keep the records of a tick that was interrupted when it was done, for the next report."""
+        report = self._tracker.unread
+        if report is not None:
+            records = [*self._records, *report.updates]
+            self._records, self._tracker.unread = records, None
 
     def checkpoint(self) -> Checkpoint:
         """Return a copy of all that changes, from which `restore` goes on with the same bits.
@@ -533,17 +567,15 @@ class Tracker:
         their detections.
         """
         with self._turn:
+            self._read_report()
             final = self._tracker.finish()
-            updates = self._tracker.last_updates
-            self._counts = self._counts_plus(
-                Counter((update.sensor, str(update.disposition)) for update in updates)
-            )
+            counts = self._counts_plus((*self._records, *self._tracker.last_updates))
+            self._counts, self._records, self._tracker.last_updates = counts, [], ()
             return final
 
-    def _counts_plus(
-        self, counts: Mapping[tuple[str, str], int]
-    ) -> dict[str, Counter[str]]:
-        """Return the numbers of detections by sensor and disposition, including the new `counts`."""
+    def _counts_plus(self, updates: Sequence[UpdateRecord]) -> dict[str, Counter[str]]:
+        """Return the numbers of detections by sensor and disposition, including new `updates`."""
+        counts = Counter((update.sensor, str(update.disposition)) for update in updates)
         result = {sensor: counter.copy() for sensor, counter in self._counts.items()}
         for (sensor, disposition), count in counts.items():
             name = self._name_for_counts(sensor)
@@ -551,9 +583,18 @@ class Tracker:
         return result
 
 
+class _RefusedError(Exception):
+    """A message that is not used, with the reason."""
+
+
 def _rule(error: InvalidMessageError) -> str:
     """Return the expected value in the message of `error`, without the given value, so that reasons can be counted."""
     return str(error).partition(", not ")[0]
+
+
+def _unreadable(error: Exception) -> str:
+    """Return the reason why a message is not used that raised `error`."""
+    return f"message cannot be read ({type(error).__name__})"
 
 
 def _recorded_ns(value: object) -> int:

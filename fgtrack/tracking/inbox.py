@@ -18,6 +18,7 @@ from fgtrack.core.types import (
     Detection,
     DetectionList,
     Disposition,
+    EgoState,
     FloatArray,
     Frame,
     UpdateRecord,
@@ -45,7 +46,7 @@ class Batch:
     last: bool = True
     """True for the newest batch of its message; only detections with stamps of their own make several."""
     since_ns: int | None = None
-    """First tick at which the batch had to wait, see `Inbox.collect`; None if it never had to."""
+    """First tick at which the batch had to wait, see `Inbox.due`; None if it never had to."""
 
 
 def record(
@@ -197,12 +198,40 @@ def _origin(sensor: str, detection: Detection) -> _Origin:
 _values = attrgetter(*(each.name for each in fields(Detection)))
 
 
+def _key(
+    message: DetectionList, usable: Sequence[bool]
+) -> tuple[str, int, Frame, bytes]:
+    """Return what a message has in common with its copies.
+
+    These are its usable detections, in any order, by their bits: NaN equals nothing.
+    """
+    values = list(map(_values, compress(message.objects, usable)))
+    try:
+        # 2: without references to shared values
+        contents = list(map(marshal.dumps, values, repeat(2)))
+    except ValueError:  # numbers of other libraries
+        contents = [repr(each).encode() for each in values]
+    return (
+        message.sensor,
+        message.stamp_ns,
+        message.frame,
+        # Unlike a hash, the digest is the same in the process that loads a saved tracker.
+        blake2b(b"".join(sorted(contents)), digest_size=16).digest(),
+    )
+
+
 class Inbox(Stateful):
-    """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
+    """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections.
+
+    An interrupt loses no detection and counts none twice. One statement assigns all that a message changes, and no
+    interrupt comes inside a statement that calls nothing.
+    """
 
     STATE: ClassVar[tuple[str, ...]] = (
         "_receipts_ns",
-        "_pending",
+        "pending",
+        "ended",
+        "received",
         "_originals",
     )
 
@@ -220,11 +249,17 @@ class Inbox(Stateful):
         self._receipts_ns: dict[
             tuple[str, int, Frame, bytes], int
         ] = {}  # of lists, in order of receipt
-        self._pending: list[Batch] = []
+        self.pending: list[Batch] = []
+        """Batches that wait for their tick."""
+        self.ended: list[list[UpdateRecord]] = []
+        """Records that `put` has returned, of one message each, until a tick reports them."""
+        self.received: DetectionList | EgoState | None = None
+        """The newest message of which everything is noted."""
         self._originals: dict[_Origin, DetectionList] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
-        """Receive a message; the records of detections that end here.
+        """Receive a message; return the records of detections that end here.
+
         A message is repeated if an earlier one of the sensor had its stamp and contents.
         """
         sensor = self._sensors[message.sensor]
@@ -232,8 +267,36 @@ class Inbox(Stateful):
         usable = [
             is_usable(detection, sensor, at_origin) for detection in message.objects
         ]
-        if self._is_copy(message, usable):
-            return records(message, Disposition.DUPLICATE)
+        self._forget_lists(message.receipt_ns)
+        key, pending = _key(message, usable), self.pending
+        receipt_ns = self._receipts_ns.get(key)
+        if receipt_ns is None:
+            ended, pending = self._sorted(message, usable)
+            receipt_ns = message.receipt_ns
+        else:
+            ended = records(message, Disposition.DUPLICATE)
+        all_ended = [*self.ended, ended]
+        # A list without usable detections equals no other one, and is not remembered.
+        receipts_ns = {} if message.objects and not any(usable) else self._receipts_ns
+        self.pending, self.ended, receipts_ns[key], self.received = (
+            pending,
+            all_ended,
+            receipt_ns,
+            message,
+        )
+        return ended
+
+    def _forget_lists(self, receipt_ns: int) -> None:
+        """Forget the lists that were received long before `receipt_ns`."""
+        oldest_ns, receipts_ns = receipt_ns - self._memory_ns, self._receipts_ns
+        while receipts_ns and receipts_ns[first := next(iter(receipts_ns))] < oldest_ns:
+            del receipts_ns[first]
+
+    def _sorted(
+        self, message: DetectionList, usable: Sequence[bool]
+    ) -> tuple[list[UpdateRecord], list[Batch]]:
+        """Return the records of the detections of `message` that end here, and all batches that wait from now on."""
+        sensor, pending = self._sensors[message.sensor], self.pending.copy()
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
         own_ns = stamps(message, sensor)
@@ -243,7 +306,7 @@ class Inbox(Stateful):
             if (
                 fate is None
                 and sensor.copies_s
-                and self._is_heard(message, index, stamp_ns, sensor.copies_s)
+                and self._is_heard(message, index, stamp_ns, pending)
             ):
                 fate = Disposition.DUPLICATE
             if fate is None:
@@ -252,10 +315,10 @@ class Inbox(Stateful):
                 ended.append(record(message, index, fate))
         newest_ns = max(kept, default=0)
         for stamp_ns, indices in kept.items():
-            self._pending.append(
+            pending.append(
                 Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns)
             )
-        return ended
+        return ended, pending
 
     def _fate(self, message: DetectionList, stamp_ns: int) -> Disposition | None:
         """Return how detections of `message` with this stamp end that are too late, or stamped in the future."""
@@ -269,11 +332,14 @@ class Inbox(Stateful):
         )
 
     def _is_heard(
-        self, message: DetectionList, index: int, stamp_ns: int, copies_s: float
+        self, message: DetectionList, index: int, stamp_ns: int, pending: list[Batch]
     ) -> bool:
-        """True if another receiver has heard the message of detection `index`; the earliest stamp in a tick counts."""
-        item = message.objects[index]
-        if item.id is None:
+        """True if another receiver has heard the message of detection `index`.
+
+        The earliest stamp in a tick counts: it replaces the stamp of the detection in `pending`.
+        """
+        item, copies_s = message.objects[index], self._sensors[message.sensor].copies_s
+        if item.id is None or not copies_s:
             return False
         oldest_ns = message.receipt_ns - nanoseconds(copies_s)
         while (
@@ -286,7 +352,7 @@ class Inbox(Stateful):
         original = self._originals.setdefault(key, message)
         if original is message:
             return False
-        for row, batch in enumerate(self._pending):
+        for row, batch in enumerate(pending):
             if batch.message is not original or stamp_ns >= batch.stamp_ns:
                 continue
             alike = tuple(
@@ -295,79 +361,49 @@ class Inbox(Stateful):
                 if _origin(message.sensor, original.objects[i]) == key
             )
             rest = tuple(i for i in batch.indices if i not in alike)
-            self._pending[row] = (
+            pending[row] = (
                 replace(batch, indices=rest)
                 if rest
                 else replace(batch, stamp_ns=stamp_ns)
             )
             if rest and alike:
-                self._pending.append(Batch(original, stamp_ns, alike, last=False))
+                pending.append(Batch(original, stamp_ns, alike, last=False))
         return True
-
-    def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
-        """True if `message` repeats one that is remembered; it is remembered from now on.
-        Compared are its usable detections, in any order, by their bits: NaN equals nothing.
-        """
-        if message.objects and not any(usable):
-            return False
-        oldest_ns = message.receipt_ns - self._memory_ns
-        while (
-            self._receipts_ns
-            and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns
-        ):
-            del self._receipts_ns[first]
-        values = list(map(_values, compress(message.objects, usable)))
-        try:
-            contents = list(
-                map(marshal.dumps, values, repeat(2))
-            )  # 2: without references to what is shared
-        except ValueError:  # numbers of other libraries
-            contents = [repr(each).encode() for each in values]
-        key = (
-            message.sensor,
-            message.stamp_ns,
-            message.frame,
-            # Unlike a hash, the digest is the same in the process that loads a saved tracker.
-            blake2b(b"".join(sorted(contents)), digest_size=16).digest(),
-        )
-        if key in self._receipts_ns:
-            return True
-        self._receipts_ns[key] = message.receipt_ns
-        return False
 
     @property
     def held_ns(self) -> int:
-        """Oldest stamp of the batches that `collect` has not returned; `FOREVER` if it has returned all."""
-        return min((batch.stamp_ns for batch in self._pending), default=FOREVER)
+        """Oldest stamp of the pending batches; `FOREVER` without any."""
+        return min((batch.stamp_ns for batch in self.pending), default=FOREVER)
 
-    def collect(
+    def collect(self) -> list[Batch]:
+        """Return all pending batches, oldest stamp first, and forget them and the records."""
+        ready, self.pending, self.ended = self.due()[0], [], []
+        return ready
+
+    def due(
         self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
-    ) -> list[Batch]:
-        """Return everything received and not yet returned, oldest stamp first.
+    ) -> tuple[list[Batch], list[Batch]]:
+        """Return the pending batches that are ready, oldest stamp first, and those that stay pending.
 
-        `waits` is called for each batch at the tick `now_ns`. A waiting batch stays in the inbox until the next call.
-        All batches of the same message stay too, because a message misses tracks as a whole. Later batches of the same
-        sensor stay as well.
+        `waits` is called for each batch at the tick `now_ns`. With a batch that waits, all batches of its message stay,
+        because a message misses tracks as a whole. Later batches of the same sensor stay as well.
         """
-        if not self._pending:
-            return []
         pending, held, first_ns = (
-            sorted(self._pending, key=attrgetter("stamp_ns")),
+            sorted(self.pending, key=attrgetter("stamp_ns")),
             set[int](),
             dict[str, int](),
         )
         if waits is None:
-            self._pending = []
-            return pending
+            return pending, []
         for batch in pending:
             sensor, stamp_ns = batch.message.sensor, batch.stamp_ns
             if first_ns.get(sensor, stamp_ns) < stamp_ns or waits(batch, now_ns):
                 held.add(id(batch.message))
                 first_ns.setdefault(sensor, stamp_ns)
         ready = [batch for batch in pending if id(batch.message) not in held]
-        self._pending = [
+        stay = [
             replace(batch, since_ns=now_ns) if batch.since_ns is None else batch
-            for batch in self._pending
+            for batch in self.pending
             if id(batch.message) in held
         ]
-        return ready
+        return ready, stay

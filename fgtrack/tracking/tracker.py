@@ -149,6 +149,7 @@ class Tracker:
         "_directed",
         "_newborn",
         "refused_ego",
+        "unread",
         "last_updates",
     )
 
@@ -190,8 +191,19 @@ class Tracker:
         """Delays of the messages of each sensor, and of the ego under `EGO`."""
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
+        self.unread: TickReport | None = None
+        """Report of the newest tick, until its reader sets None: an interrupt may keep a report from its reader."""
         self.last_updates: tuple[UpdateRecord, ...] = ()
-        """Records of the detections that `finish` has processed, which no tick has."""
+        """Records of the detections that `finish` has processed, which no tick has, until their reader sets ()."""
+
+    @property
+    def received(self) -> EgoState | DetectionList | None:
+        """The newest message that `receive` has taken to the end; it takes no other message in part."""
+        return self._parts.inbox.received
+
+    @received.setter
+    def received(self, message: EgoState | DetectionList) -> None:
+        self._parts.inbox.received = message
 
     @property
     def ego_jumps(self) -> int:
@@ -251,6 +263,7 @@ class Tracker:
             reason = self._parts.ego.receive(message)
             if reason is not None:
                 self.refused_ego[reason] += 1
+            self.received = message
             return
         if message.sensor not in self._parts.sensors:
             check_sensor(message.sensor, self._parts.sensors)
@@ -262,7 +275,7 @@ class Tracker:
             message.stamp_ns
         ]
         self.delays[message.sensor].add(min(own_ns), message.receipt_ns, max(own_ns))
-        self._records.append(self._parts.inbox.put(message))
+        self._parts.inbox.put(message)
 
     def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
         """Process everything received up to `now_ns`, but for lists that wait for an ego message.
@@ -272,7 +285,7 @@ class Tracker:
         self._tick += 1
         parts, bank = self._parts, self._parts.bank
         self._fail_rest()  # of a tick that was interrupted
-        self._waiting += parts.inbox.collect(now_ns, None if is_last else parts.wait)
+        self._collect(now_ns, None if is_last else parts.wait)
         held_ns = parts.inbox.held_ns
         self._expire(
             now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)])
@@ -292,8 +305,21 @@ class Tracker:
         report = TickReport.made_later(
             self._tick, now_ns, smoothed, tracks=tracks, updates=updates
         )
-        self._records = []  # last: until here an interrupt leaves them for the next tick
+        self._records, self.unread = [], report
         return report
+
+    def _collect(self, now_ns: int, waits: Callable[[Batch, int], bool] | None) -> None:
+        """Take the batches that are ready, and the records of detections that ended at their receipt."""
+        inbox = self._parts.inbox
+        ready, stay = inbox.due(now_ns, waits)
+        waiting, ended = [*self._waiting, *ready], [*self._records, *inbox.ended]
+        # One statement, so that an interrupt comes before or after it.
+        self._waiting, self._records, inbox.pending, inbox.ended = (
+            waiting,
+            ended,
+            stay,
+            [],
+        )
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window.
@@ -301,9 +327,10 @@ class Tracker:
         Lists that still wait for an ego message are processed first; `last_updates` has their records.
         """
         self._fail_rest()
-        self._waiting += self._parts.inbox.collect()
+        self._collect(self._parts.bank.present_ns, None)
         self._process_waiting()
-        self.last_updates, self._records = tuple(chain.from_iterable(self._records)), []
+        updates = (*self.last_updates, *chain.from_iterable(self._records))
+        self.last_updates, self._records = updates, []
         self._end(self._parts.bank.track_ids)
         return tuple(self._smoothed())
 
