@@ -9,11 +9,12 @@ from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.types import Message
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.sample import Sample, Test, first_messages
+from fgtrack.meaning.velocity_test import velocity_decisions
 
 __all__ = ["TESTS", "decided"]
 
 #: Tests in their order: frames, mounts, velocities, times, orientations.
-TESTS: tuple[Test, ...] = ()
+TESTS: tuple[Test, ...] = (velocity_decisions,)
 
 
 def decided(

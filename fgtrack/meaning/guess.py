@@ -59,8 +59,11 @@ _SKIPPED = frozenset(
         "accuracy",
     )
 )
-#: Words that mark a velocity, a size, or a vector that is not read.
-_OF_VELOCITY = frozenset(("velocity", "vel", "v", "speed", "twist", "vrel", "linear"))
+#: Words that mark a velocity, a position, a size, or a vector that is not read.
+_OF_VELOCITY = frozenset(
+    ("velocity", "vel", "v", "speed", "twist", "vrel", "vabs", "linear")
+)
+_OF_POSITION = frozenset(("distance", "dist", "displacement", "offset", "d", "rel"))
 _OF_SIZE = frozenset(
     ("size", "dimension", "dimensions", "extent", "extents", "scale", "shape")
 )
@@ -77,6 +80,13 @@ _OF_OTHER = frozenset(
         "q",
     )
 )
+#: Axes of a vehicle by their names, beside a word of a velocity or of a position.
+_VEHICLE_AXES = {
+    "long": "x",
+    "longitudinal": "x",
+    "lat": "y",
+    "lateral": "y",
+}
 _AXES = {
     "x": ("x_m", "velocity x", "length_m"),
     "y": ("y_m", "velocity y", "width_m"),
@@ -88,13 +98,14 @@ _NAMES = {
     "(receipt|received|receive|recv|arrival|rx|log|network|sub)_(time|stamp|timestamp)",
     "stamp": "stamp|timestamp|time|t|epoch|secs?|seconds",
     "yaw_rate_radps": "yaw_?rate|turn_rate|heading_rate|omega|angular_(velocity_)?z|gyro_z",
-    "range_rate_mps": "range_?rate|doppler|rdot|vr|radial_(velocity|speed)|(velocity|speed)_radial",
+    "range_rate_mps": "range_?rate|doppler|rdot|vr|vrel|(radial|doppler|closing|relative|rel|approach)_"
+    "(velocity|vel|speed)|(velocity|vel|speed|v)_(radial|doppler|relative|rel)",
     "yaw_rad": "yaw|heading|hdg|psi|theta|course|cog|orientation|(yaw|heading)_angle",
     "bearing_rad": "bearing|azimuth|az|angle|phi|(bearing|azimuth)_angle",
     "range_m": "range|distance|dist|rho|r",
     "speed_mps": "speed|velocity|vel|v|sog",
-    "velocity x": "vx|dx_dt|vlong",
-    "velocity y": "vy|dy_dt|vlat",
+    "velocity x": "(vx|dx_dt|vlong)(_rel|_abs)?",
+    "velocity y": "(vy|dy_dt|vlat)(_rel|_abs)?",
     "latitude_deg": "lat|latitude",
     "longitude_deg": "lon|lng|long|longitude",
     "x_m": "px|east|easting|e|dx|longitudinal|utm_x",
@@ -107,6 +118,8 @@ _NAMES = {
     "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|track|object|target",
     "class_name": "class|class_name|label|category|type|kind|classification",
 }
+#: Range of latitudes around 0 from which they are positions in m.
+_LOCAL_DEG = 2.0
 #: Plausible periods of a source.
 _PERIOD_S = (5e-4, 20.0)
 #: Smallest distance of two positions from which a course is computed.
@@ -150,15 +163,34 @@ def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
         component, unit = _component(name)
         if component is not None and component not in guessed:
             guessed[component] = _converted(component, unit, name, samples)
+    _without_degrees(guessed, values)
     vx = guessed.pop("velocity x", None)
     vy = guessed.pop("velocity y", None)
-    if vx and vy and "speed_mps" not in guessed:
+    if vx and vy and guessed.keys().isdisjoint(("speed_mps", "range_rate_mps")):
         names = [_name(vx), _name(vy)]
         scale = vx.path.scale if isinstance(vx.path, Field) else 1.0
         guessed["speed_mps"] = Guess(
             names if scale == 1.0 else Field(names, scale), "length of the velocity"
         )
     return guessed
+
+
+def _without_degrees(
+    guessed: dict[str, Guess], values: Mapping[str, Sequence[float]]
+) -> None:
+    """Turn `lat` and `long` into y and x in the frame of the vehicle if their values are no degrees on Earth."""
+    names = [
+        _name(guessed[key]) if key in guessed else ""
+        for key in ("latitude_deg", "longitude_deg")
+    ]
+    if "x_m" in guessed or words_of(names[1])[-1:] != ["long"]:
+        return
+    lat = [one for one in values.get(names[0], ()) if math.isfinite(one)]
+    if lat and min(lat) < 0.0 < max(lat) and max(lat) - min(lat) > _LOCAL_DEG:
+        reason = "around 0, so it is no position on Earth"
+        guessed["y_m"] = Guess(names[0], reason)
+        guessed["x_m"] = Guess(names[1], reason)
+        del guessed["latitude_deg"], guessed["longitude_deg"]
 
 
 def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
@@ -257,6 +289,9 @@ def _component(name: str) -> tuple[str | None, str]:
             return "stamp", unit
         return ("speed_mps" if unit in _SCALES["mps"] else None), unit
     axis = None
+    others = set(base[:-1])
+    if base[-1] in _VEHICLE_AXES and others & (_OF_VELOCITY | _OF_POSITION):
+        base = [*base[:-1], _VEHICLE_AXES[base[-1]]]
     if base[-1] in _AXES:
         axis = base[-1]
     elif base[0] in _AXES and base[-1] in _OF_VELOCITY:

@@ -1,7 +1,7 @@
 """Tests what a reported velocity means, against the successive positions of the same objects."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +24,12 @@ VelocityKind = Literal[
 ]
 """Meaning of a velocity. The first three can be used; the other ones are recognised and left out."""
 
+#: Component of a detection by kind; the other kinds are not used.
+_COMPONENTS: Mapping[VelocityKind, str] = {
+    "absolute": "speed_mps",
+    "relative": "range_rate_mps",
+    "radial": "range_rate_mps",
+}
 #: Factor to m/s by unit.
 SPEED_UNITS = {
     "m/s": 1.0,
@@ -69,6 +75,11 @@ class VelocityMeaning:
     """Difference from the motion between successive positions that 80 % stay below; NaN without a test."""
     reason: str
     """Result of the test in words."""
+
+    @property
+    def component(self) -> str | None:
+        """Component of a detection for these values; None if no component takes them."""
+        return None if self.kind is None else _COMPONENTS.get(self.kind)
 
     @property
     def scale(self) -> float:
@@ -147,7 +158,8 @@ def meaning_of(
         if fit.misfit_mps <= _LIKE_FACTOR * best.misfit_mps + _LIKE_MPS
     ]
     chosen = min(like, key=lambda fit: (order.index(fit.kind), fit.misfit_mps))
-    others = [fit for fit in fits if fit.kind != chosen.kind]
+    component = _COMPONENTS.get(chosen.kind)
+    others = [fit for fit in fits if _COMPONENTS.get(fit.kind) != component]
     rival = others[0] if others else None
     if rival is not None and rival in like:
         text = (

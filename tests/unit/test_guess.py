@@ -32,6 +32,17 @@ from fgtrack.meaning.guess import agreeing_with_motion, guesses, time_unit
         ("x_std", [4.0], None, None),
         ("acceleration.x", [4.0], None, None),
         ("temperature", [4.0], None, None),
+        ("Obj_DistLong", [40.0], "x_m", "Obj_DistLong"),
+        ("dist_lat", [-3.0], "y_m", "dist_lat"),
+        ("distance_lateral", [-3.0], "y_m", "distance_lateral"),
+        ("lat", [48.1], "latitude_deg", "lat"),
+        ("doppler_velocity", [-3.0], "range_rate_mps", "doppler_velocity"),
+        (
+            "closing_speed_kmh",
+            [3.0],
+            "range_rate_mps",
+            Field("closing_speed_kmh", 1.0 / 3.6),
+        ),
     ],
 )
 def test_a_field_is_taken_by_its_name_and_its_unit_by_name_and_values(
@@ -39,6 +50,19 @@ def test_a_field_is_taken_by_its_name_and_its_unit_by_name_and_values(
 ):
     found = {key: one.path for key, one in guesses({name: samples}).items()}
     assert found == ({} if component is None else {component: path})
+
+
+@pytest.mark.parametrize(
+    ("lat", "expected"),
+    [
+        ([-3.0, 0.1, 3.5], {"x_m": "long", "y_m": "lat"}),
+        ([48.1, 48.2], {"latitude_deg": "lat", "longitude_deg": "long"}),
+        ([-0.1, 0.1], {"latitude_deg": "lat", "longitude_deg": "long"}),
+    ],
+)
+def test_lat_and_long_around_0_are_distances(lat, expected):
+    found = guesses({"lat": lat, "long": [20.0, 30.0, 40.0]})
+    assert {key: one.path for key, one in found.items()} == expected
 
 
 def test_two_velocities_are_a_speed_and_of_two_names_the_first_is_taken():
