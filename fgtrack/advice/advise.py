@@ -6,10 +6,13 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
+from fgtrack.advice.checks import Check, Evidence, checks
 from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import PairedReplay
+from fgtrack.advice.proposals import benefit, effect
 from fgtrack.advice.run_quality import RunQuality, harm, noise_findings, objection
+from fgtrack.clocks.agreement import Agreement, agreement_findings, agreements
 from fgtrack.clocks.arrivals import (
     FEWEST,
     LONGEST_STORAGE_S,
@@ -31,8 +34,10 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.meaning.assumed import source_of
 from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.draft import drafted
 from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
+from fgtrack.meaning.times import clock_constant
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.clock import corrected
@@ -88,9 +93,10 @@ def advise(
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
     result = Assumed(draft.config, draft.assumed.assumptions)
-    return Adviser(str(recording), messages, result, reference, on_step).advice(
-        broken, tune, ledger
+    adviser = Adviser(
+        str(recording), messages, result, reference, on_step, draft.decisions
     )
+    return adviser.advice(broken, tune, ledger)
 
 
 class Adviser:
@@ -103,6 +109,7 @@ class Adviser:
         found: Assumed,
         reference: str | None = None,
         on_step: Callable[[str, float], None] = lambda text, share: None,
+        decisions: Sequence[Decision] = (),
     ) -> None:
         self._recording = recording
         self._messages = messages
@@ -110,7 +117,11 @@ class Adviser:
         self._on_step = on_step
         self._assumed = found
         self._config = found.config
+        self._decisions = decisions
         self._findings: list[Finding] = []
+        # Findings with settings that have not helped alone; together they may.
+        self._pending: list[Finding] = []
+        self._agreements: list[Agreement] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(messages_within(messages, nanoseconds(TRACKED_S)))
         self._outcomes: list[tuple[Config, RunQuality | None]] = []
@@ -126,7 +137,8 @@ class Adviser:
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
-        self._take(self._unknown_sensors())
+        self._findings += self._questions()
+        self._adopt(self._unknown_sensors())
         before = self._config
         sensors = [
             name
@@ -137,22 +149,8 @@ class Adviser:
             raise DataError(
                 f"{self._recording}: no detections of a configured sensor; configure its sensors (sensors.NAME)"
             )
-        for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
-            self._take(stamp_findings(self._arrivals[name]))
-        for one in input_checks(
-            list(messages_within(self._messages, nanoseconds(TRIAL_S))), self._config
-        ):
-            self._take(
-                [
-                    Finding(
-                        "input",
-                        one.about,
-                        94.0 if one.is_blocking else 45.0,
-                        f"{one.text}.",
-                        one.settings,
-                    )
-                ]
-            )
+        self._take(self._stamps(sensors))
+        self._take(self._input())
         self._on_step("clocks", 0.1)
         self._take(self._offsets())
         seen = arrivals_of(
@@ -170,12 +168,20 @@ class Adviser:
         self._take(self._ego(seen))
         self._on_step("tracking", 0.3)
         self._take(self._diagnostics(self._outcome(self._config)))
-        self._withdraw_harm(before)
+        self._settle()
         new = self._outcome(self._config)
+        if new is not None:
+            self._agreements = agreements(self._tracked, self._config, new.run)
+            self._take(agreement_findings(self._agreements))
         if new is not None and not self._is_useless:
-            self._take(noise_findings(new))
+            evidence = self._evidence(seen, new)
+            self._take(
+                item
+                for item in noise_findings(new)
+                if evidence.doubt(item.about) is None
+            )
         if tune and new is not None:
-            self._take(self._tuned(new))
+            self._adopt(self._tuned(new))
         old = self._outcome(before)
         new = self._outcome(self._config)
         policies = None
@@ -186,10 +192,12 @@ class Adviser:
                 )
             )
             policies = summary(PairedReplay.of(first, self._config)) if ledger else None
+        made = checks(self._evidence(seen, new))
+        self._findings += _failed_checks(made, self._findings)
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
-            fine=tuple(self._fine(seen, new)),
+            checks=tuple(made),
             config=self._config,
             arrivals=tuple(seen.values()),
             overtaken=shares,
@@ -199,41 +207,90 @@ class Adviser:
             ledger=policies,
         )
 
-    def _take(self, findings: Iterable[Finding]) -> None:
-        """Store findings and apply their settings."""
+    def _adopt(self, findings: Iterable[Finding]) -> None:
+        """Store findings and apply their settings; they are not replayed here."""
         for item in findings:
             self._findings.append(item)
             self._config = read_config(self._config, item.settings)
 
-    def _withdraw_harm(self, before: Config) -> None:
-        """Withdraw settings that make the replay worse; their findings stay."""
-        if self._is_harm(before, self._config) is None:
-            return
-        self._config = before
-        for one in sorted(
-            filter(lambda one: one.settings, self._findings),
-            key=lambda one: -one.weight,
-        ):
-            config = read_config(self._config, one.settings)
-            worse = self._is_harm(self._config, config)
-            if worse is None:
-                self._config = config
+    def _take(self, findings: Iterable[Finding]) -> None:
+        """Store findings; replay their settings, and apply those that help."""
+        for item in findings:
+            if not item.settings:
+                self._findings.append(item)
                 continue
-            keys = ", ".join(one.settings)
-            text = (
-                f"{one.text} {keys} would correct this, but then {worse}: not changed."
-            )
-            self._findings[self._findings.index(one)] = replace(
-                one, text=text, settings={}
-            )
+            config = read_config(self._config, item.settings)
+            helps = self._helps(config)
+            if helps is None:
+                self._pending.append(item)
+                continue
+            self._config = config
+            self._findings.append(replace(item, effect=helps))
 
-    def _is_harm(self, old: Config, new: Config) -> str | None:
-        """Return a sentence on the result that gets worse from `old` to `new`; None if none does."""
-        before = self._outcome(old)
-        after = self._outcome(new)
-        if old == new or before is None or after is None:
+    def _settle(self) -> None:
+        """Replay the pending settings together: apply them if they help together, else withdraw them."""
+        together = self._config
+        for item in self._pending:
+            together = read_config(together, item.settings)
+        helps = self._helps(together) if len(self._pending) > 1 else None
+        for item in self._pending:
+            keys = ", ".join(item.settings)
+            if helps is not None:
+                together_helps = f"with the other settings, {helps}"
+                self._findings.append(replace(item, effect=together_helps))
+                continue
+            config = read_config(self._config, item.settings)
+            old, new = self._outcome(self._config), self._outcome(config)
+            worse = None if old is None or new is None else harm(old, new)
+            why = worse or f"nothing improves ({effect(old, new)})"
+            text = f"{item.text} {keys} was replayed, but {why}: not changed."
+            self._findings.append(replace(item, text=text, settings={}))
+        self._config = self._config if helps is None else together
+        self._pending = []
+
+    def _helps(self, config: Config) -> str | None:
+        """Return a clause on the result that improves with `config`; None if none does, or if one gets worse."""
+        old, new = self._outcome(self._config), self._outcome(config)
+        if config == self._config or (
+            old is not None and new is not None and harm(old, new) is not None
+        ):
             return None
-        return harm(before, after)
+        return benefit(old, new)
+
+    def _questions(self) -> Iterator[Finding]:
+        """Yield the open questions about what the numbers of the recording mean."""
+        for item in self._decisions:
+            if item.certainty == "open":
+                yield Finding(
+                    "question", item.about, 96.0, f"{item.reason}. {item.question}."
+                )
+
+    def _stamps(self, sensors: Sequence[str]) -> Iterator[Finding]:
+        """Yield known differences of clocks, and other findings on stamps, of the sensors and the ego."""
+        for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
+            one = self._arrivals[name]
+            constant = None
+            if name != EGO and len(one.stamps_ns) >= FEWEST and one.stamps_ns.any():
+                offset_s = self._config.sensors[name].clock_offset_s
+                constant = clock_constant(one.delays_s + offset_s)
+            if constant is None:
+                yield from stamp_findings(one)
+                continue
+            key = f"sensors.{name}.clock_offset_s"
+            side = "after" if constant.offset_s > 0.0 else "before"
+            text = (
+                f"its stamps lie {abs(constant.offset_s):g} s {side} the recorder's clock ({constant.name}); after the "
+                f"correction its median delay is {milliseconds(constant.delay_s)}."
+            )
+            total_s = round(offset_s + constant.offset_s, 4)
+            yield Finding("clock", name, 93.0, text, {key: total_s})
+
+    def _input(self) -> Iterator[Finding]:
+        """Yield probable errors in the reading of the first seconds."""
+        first = list(messages_within(self._messages, nanoseconds(TRIAL_S)))
+        for one in input_checks(first, self._config):
+            weight = 94.0 if one.is_blocking else 45.0
+            yield Finding("input", one.about, weight, f"{one.text}.", one.settings)
 
     @property
     def _is_useless(self) -> bool:
@@ -422,47 +479,40 @@ class Adviser:
         self._outcomes.append((config, result))
         return result
 
-    def _fine(
+    def _evidence(
         self, seen: Mapping[str, Arrivals], outcome: RunQuality | None
-    ) -> Iterator[str]:
-        """Yield the checks without a finding."""
-        wrong = {(item.kind, item.about) for item in self._findings}
-        kinds = {kind for kind, _ in wrong}
-        ego = self._arrivals.get(EGO)
-        if (
-            ego is not None
-            and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)}
-            and ego.period_s
-        ):
-            longest = milliseconds(float(ego.steps_s.max()))
-            delay = milliseconds(ego.quantile_s(0.5))
-            yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
-        offsets = [] if self._clocks is None else self._clocks.others
-        noise = () if outcome is None else outcome.noise
-        stamped = [
-            name
-            for name, item in seen.items()
-            if len(item.stamps_ns) >= FEWEST and not item.is_receipt
-        ]
-        named = {
-            "stamps": [name for name in stamped if ("clock", name) not in wrong],
-            "clock": [
-                item.sensor for item in offsets if item.is_known and not item.is_off
-            ],
-            "noise": [
-                item.sensor
-                for item in noise
-                if ("noise", item.sensor) not in wrong and item.is_consistent
-            ],
-        }
-        yield from (
-            f"{what} of {', '.join(names)}" for what, names in named.items() if names
+    ) -> Evidence:
+        """Return the results on which the tests are based."""
+        lists = (item for item in self._messages if isinstance(item, DetectionList))
+        return Evidence(
+            self._config,
+            self._findings,
+            self._arrivals.get(EGO),
+            seen,
+            {item.sensor for item in lists if item.frame != "map"},
+            self._clocks,
+            self._agreements,
+            self._decisions,
+            outcome,
         )
-        if not kinds & {"input", "model"}:
-            yield "frames, angles and fields"
-        if "window" not in kinds and any(item.has_stamps for item in seen.values()):
-            found = self._config.effective
-            yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
-        if "track" not in kinds and outcome is not None and outcome.truth is not None:
-            tracked = percent(outcome.truth.tracked_share_in_view)
-            yield f"tracks ({outcome.births} births, {tracked} of the time in view tracked)"
+
+
+# Kinds of the findings that report a failed test, by its property; other tests fail by their findings.
+_REPORTED_BY = {
+    "use": ("track", "clock", "input", "question"),
+    "births": ("track",),
+    "truth": (),
+    "positions against speed": (),
+}
+
+
+def _failed_checks(made: Iterable[Check], findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings on the failed tests that no finding reports yet."""
+    known = {(item.kind, item.about) for item in findings}
+    return [
+        Finding("test", one.about, 60.0, f"{one.what}: {one.text}.")
+        for one in made
+        if one.verdict == "finding"
+        and one.what in _REPORTED_BY
+        and not any((kind, one.about) in known for kind in _REPORTED_BY[one.what])
+    ]

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from textwrap import TextWrapper
 
+from fgtrack.advice.checks import Check
 from fgtrack.advice.run_quality import RunQuality
 from fgtrack.clocks.arrivals import Arrivals
 from fgtrack.config.settings import Config
@@ -24,8 +25,8 @@ class Advice:
     recording: str
     findings: tuple[Finding, ...]
     """The findings, the most important first."""
-    fine: tuple[str, ...]
-    """Checks without a finding."""
+    checks: tuple[Check, ...] = field(repr=False)
+    """All tests, with their numbers, or with the reason why a test was not made."""
     config: Config = field(repr=False)
     """The advised configuration. It contains fitted noise if that was requested."""
     arrivals: tuple[Arrivals, ...] = field(repr=False)
@@ -53,12 +54,29 @@ class Advice:
         return tuple(result.values())
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """The findings, and a line with the checks without a finding."""
-        return (
-            *map(str, self.findings),
-            *([f"No finding on: {', '.join(self.fine)}."] if self.fine else []),
+    def fine(self) -> tuple[str, ...]:
+        """Line of the passed tests, with their numbers, for each sensor, the ego and the tracks."""
+        return self._lines("fine", "Fine")
+
+    @property
+    def untested(self) -> tuple[str, ...]:
+        """Line of the tests that were not made, with the reasons, for each sensor, the ego and the tracks."""
+        return self._lines("untested", "Not tested")
+
+    def _lines(self, verdict: str, word: str) -> tuple[str, ...]:
+        by_subject: dict[str, list[str]] = {}
+        for one in self.checks:
+            if one.verdict == verdict:
+                by_subject.setdefault(one.about, []).append(str(one))
+        return tuple(
+            f"{word}, {about}: {'; '.join(texts)}."
+            for about, texts in by_subject.items()
         )
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The findings, the passed tests, and the tests that were not made."""
+        return (*map(str, self.findings), *self.fine, *self.untested)
 
     @property
     def tables(self) -> Tables:
@@ -132,7 +150,7 @@ class Advice:
         return {
             "recording": self.recording,
             "findings": [asdict(item) for item in self.findings],
-            "fine": list(self.fine),
+            "checks": [asdict(item) for item in self.checks],
             "changes": [
                 {"key": item.key, "value": item.value, "why": item.reason}
                 for item in self.changes

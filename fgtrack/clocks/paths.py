@@ -221,6 +221,11 @@ def measured_positions(
                 for component, value in sensor.std.items()
                 if component in _POSITION
             },
+            std_growth={
+                component: value
+                for component, value in sensor.std_growth.items()
+                if component in _POSITION
+            },
             yaw_from_map_std_rad=None,
             max_range_m=None,
             correlation=None,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,15 @@ from fgtrack.config.settings import EgoConfig
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.finding import Finding, milliseconds, percent
 
-__all__ = ["bias_findings", "clock_findings", "clock_text", "stamp_findings"]
+__all__ = [
+    "DelayChange",
+    "bias_findings",
+    "clock_findings",
+    "clock_text",
+    "delay_change",
+    "share_ahead",
+    "stamp_findings",
+]
 
 # A stamp after its receipt counts only beyond the rounding of stamps, and for more than this share.
 _AHEAD_S = 1e-3
@@ -50,7 +59,7 @@ def stamp_findings(one: Arrivals) -> Iterator[Finding]:
         text = f"stamps and receipts differ by {off_s:.3g} s: they come from two unrelated clocks."
         yield Finding("clock", name, 95.0, text, receipt)
     elif len(one.stamps_ns) >= FEWEST:
-        ahead = float((one.delays_s < -_AHEAD_S).mean())
+        ahead = share_ahead(one)
         if ahead > _AHEAD_SHARE:
             most_s = -float(np.quantile(one.delays_s, 0.01))
             text = (
@@ -68,11 +77,50 @@ def stamp_findings(one: Arrivals) -> Iterator[Finding]:
         yield from _change(one)
 
 
-def _change(one: Arrivals) -> Iterator[Finding]:
-    """Yield a permanent change of the delay, by the medians of ten parts: a jump, or a drift."""
+def share_ahead(one: Arrivals) -> float:
+    """Return the share of stamps that lie after their receipt, beyond the rounding of stamps."""
+    return float((one.delays_s < -_AHEAD_S).mean())
+
+
+class DelayChange(NamedTuple):
+    """Largest permanent change of the mean delay of a sensor, at the best of seven splits."""
+
+    before_s: float
+    after_s: float
+    at_s: float
+    """Time of the change since the first receipt."""
+    std_s: float
+    """Standard deviation of the change."""
+    correlation: float
+    """Correlation of the delay with time, over ten parts."""
+
+    @property
+    def change_s(self) -> float:
+        """Absolute change of the mean delay."""
+        return abs(self.after_s - self.before_s)
+
+    @property
+    def limit_s(self) -> float:
+        """Least change that is no scatter."""
+        return max(_CHANGE_S, _DRIFT_STDS * self.std_s)
+
+    @property
+    def is_change(self) -> bool:
+        """True if the change is a jump or a drift, and no scatter."""
+        if self.change_s < self.limit_s:
+            return False
+        is_jump = self.change_s >= _JUMP_STDS * self.std_s
+        return is_jump or abs(self.correlation) >= _DRIFT_CORRELATION
+
+
+def delay_change(one: Arrivals) -> DelayChange | None:
+    """Return the largest permanent change of the delay, by the medians of ten parts.
+
+    None for a short recording.
+    """
     times_s = (one.receipts_ns - one.receipts_ns[0]) / 1e9
     if len(times_s) < _PARTS * FEWEST or times_s[-1] < _PARTS * _SHORTEST_PART_S:
-        return
+        return None
     medians_s = np.array(
         [np.median(part) for part in np.array_split(one.delays_s, _PARTS)]
     )
@@ -85,15 +133,20 @@ def _change(one: Arrivals) -> Iterator[Finding]:
     std_s = math.sqrt(
         within[k] / (_PARTS - 2) * (1.0 / splits[k] + 1.0 / (_PARTS - splits[k]))
     )
-    change_s = abs(after_s - before_s)
-    at_s = times_s[splits[k] * len(times_s) // _PARTS]
-    if change_s < max(_CHANGE_S, _DRIFT_STDS * std_s):
-        return
-    correlation = np.corrcoef(medians_s, np.arange(_PARTS))[0, 1]
-    if change_s >= _JUMP_STDS * std_s or abs(correlation) >= _DRIFT_CORRELATION:
+    at_s = float(times_s[splits[k] * len(times_s) // _PARTS])
+    with np.errstate(invalid="ignore", divide="ignore"):  # a constant delay
+        correlation = float(np.corrcoef(medians_s, np.arange(_PARTS))[0, 1])
+    return DelayChange(before_s, after_s, at_s, std_s, correlation)
+
+
+def _change(one: Arrivals) -> Iterator[Finding]:
+    """Yield a permanent change of the delay: a jump, or a drift."""
+    change = delay_change(one)
+    if change is not None and change.is_change:
         text = (
-            f"its delay is {milliseconds(before_s)} until about {at_s:.0f} s and {milliseconds(after_s)} after that: "
-            "its clock was set, its clock drifts, or a queue fills. No setting corrects this: synchronise the clock."
+            f"its delay is {milliseconds(change.before_s)} until about {change.at_s:.0f} s and "
+            f"{milliseconds(change.after_s)} after that: its clock was set, its clock drifts, or a queue fills. No "
+            "setting corrects this: synchronise the clock."
         )
         yield Finding("clock", one.name, 80.0, text)
 

@@ -24,13 +24,17 @@ class Finding:
     """Problem, cause and remedy."""
     settings: Mapping[str, object] = field(default_factory=dict)
     """Configuration keys and the values that correct the problem; empty if no setting does."""
+    effect: str = ""
+    """Clause with numbers on the result that improves in a replay with the settings."""
 
     def __str__(self) -> str:
         settings = ", ".join(
             f"{key}: {value:g}" if isinstance(value, float) else f"{key}: {value}"
             for key, value in self.settings.items()
         ).replace("'", "")
-        return f"{self.about}: {self.text}{f' Set {settings}.' if settings else ''}"
+        change = f" Set {settings}." if settings else ""
+        effect = f" Replayed: {self.effect}." if self.effect else ""
+        return f"{self.about}: {self.text}{change}{effect}"
 
 
 def nice_above(value: float) -> float:

@@ -74,5 +74,7 @@ def test_advice_no_longer_calls_a_late_ego_fine(tmp_path) -> None:
         advice = advise(tmp_path / f"{name}.jsonl", CONFIG)
         is_late = name == "late"
         assert is_late == any(LINE in item.text for item in advice.findings)
-        assert is_late != any(line.startswith("the ego (") for line in advice.fine)
+        assert is_late != any(
+            line.startswith("Fine, ego: states: ") for line in advice.fine
+        )
         assert sum(LINE in item.text for item in advice.findings) == is_late
