@@ -141,7 +141,7 @@ class SensorModel:
     `objects_mean`: the mean of the stamps in the list. `receipt`: the receipt time, for
     a driver that sets no stamps or uses another clock.
     """
-    clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
+    clock_offset_s: Annotated[float, Field(ge=-86_400.0, le=86_400.0)] = 0.0
     """Stamp minus time of measurement.
 
     It is subtracted from each stamp before any other use. With `stamp_from: receipt` it
