@@ -69,7 +69,7 @@ def scans_of(
             for item in each.objects
             if (at := _position_m(item)) is not None
         ]
-        table = np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+        table = np.array(rows, dtype=np.float64) if rows else np.zeros((0, 2))
         width = max(width, table.shape[1] - 2)
         positions.append(table[:, :2].reshape(-1, 2))
         raw.append(table[:, 2:])
