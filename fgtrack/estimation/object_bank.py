@@ -67,6 +67,13 @@ class Outcomes:
         return [self._answers[track_id] for track_id in track_ids]
 
 
+def as_unchanged(error: Exception, track_ids: Sequence[int]) -> Exception:
+    """Return the `EstimatorError` of an error that left the states of these tracks as before; a `DataError` itself."""
+    if isinstance(error, DataError):
+        return error
+    return EstimatorError(dict.fromkeys(track_ids, error), {}, track_ids)
+
+
 class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
     """Context that turns an exception into an `EstimatorError`: the states of these tracks are as before.
 
@@ -88,8 +95,7 @@ class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
         traceback: TracebackType | None,
     ) -> None:
         if isinstance(error, Exception) and not isinstance(error, DataError):
-            causes = dict.fromkeys(self._track_ids, error)
-            raise EstimatorError(causes, {}, self._track_ids) from error
+            raise as_unchanged(error, self._track_ids) from error
 
 
 class ObjectBank(Stateful, Generic[_E]):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import compress
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -86,11 +86,17 @@ class GuardedBank(Stateful):
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        self._ask(lambda bank: bank.advance(now_ns), changes=True)
+        try:
+            self._bank.advance(now_ns)
+        except Exception as error:
+            self._ask(lambda bank: bank.advance(now_ns), error, changes=True)
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
-        states = self._ask(lambda bank: bank.states_at(stamp_ns))
+        try:
+            states = self._bank.states_at(stamp_ns)
+        except Exception as error:
+            states = self._ask(lambda bank: bank.states_at(stamp_ns), error)
         if math.isfinite(
             np.vdot(states.means, states.means)
             + np.vdot(states.covariances, states.covariances)
@@ -109,12 +115,17 @@ class GuardedBank(Stateful):
         """Return the state of one track at `stamp_ns`, see `states_at`; of no track where it has none.
         A bank with `states_of` is asked for it alone.
         """
-        if hasattr(self._bank, "states_of"):
-            states: StatesAt = self._ask(
-                lambda bank: bank.states_of(stamp_ns, track_id)  # type: ignore[attr-defined]
+        bank: Any = self._bank  # Any: not each bank has `states_of`
+        if not hasattr(bank, "states_of"):
+            return self.states_at(stamp_ns).of(track_id)
+        try:
+            states: StatesAt = bank.states_of(stamp_ns, track_id)
+        except Exception as error:
+            states = self._ask(
+                lambda bank: bank.states_of(stamp_ns, track_id),  # type: ignore[attr-defined]
+                error,
             )
-            return states
-        return self.states_at(stamp_ns).of(track_id)
+        return states
 
     def window(self, track_id: int) -> "Window":
         """Return a copy of the window of a track. Raises `CallError` unless the estimator is a smoother."""
@@ -226,7 +237,12 @@ class GuardedBank(Stateful):
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:
-            states, unsound = self._ask(lambda bank: self._checked(bank.present()))
+            try:
+                states, unsound = self._checked(self._bank.present())
+            except Exception as error:
+                states, unsound = self._ask(
+                    lambda bank: self._checked(bank.present()), error
+                )
             if not unsound:
                 return states
             for track_id, fault in [
@@ -239,7 +255,13 @@ class GuardedBank(Stateful):
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
-        reports, unsound = self._ask(lambda bank: _smoothed(bank.smoothed()))
+        try:
+            reports = self._bank.smoothed()
+            if not reports:
+                return reports
+            reports, unsound = _smoothed(reports)
+        except Exception as error:
+            reports, unsound = self._ask(lambda bank: _smoothed(bank.smoothed()), error)
         for fault in unsound.values():
             self.failures.add(fault)
         return (
@@ -258,36 +280,43 @@ class GuardedBank(Stateful):
             )
         return states, faults(states)
 
-    def _ask(self, question: Callable[[TrackBank], _T], *, changes: bool = False) -> _T:
-        """Return the bank's answer, when the tracks that prevent one have ended.
+    def _ask(
+        self,
+        question: Callable[[TrackBank], _T],
+        error: Exception,
+        *,
+        changes: bool = False,
+    ) -> _T:
+        """Return the bank's answer to a question that raised `error`, when the tracks that prevent one have ended.
         Raises `MemoryError` where there is not enough for the answer, unless the question `changes` states.
         """
         is_new = False
         while True:
+            if isinstance(error, DataError):
+                raise error
+            if isinstance(error, MemoryError) and not changes:
+                raise error
+            self.failures.add(Failure.ESTIMATOR_RAISED)
+            if (
+                isinstance(error, EstimatorError)
+                and error.causes.keys() & self._alive.keys()
+            ):
+                self._end(error.causes, Failure.ESTIMATOR_RAISED)
+            elif self._alive:
+                self._start_over(error)
+            elif is_new:
+                text = f"the estimator fails even without tracks ({type(error).__name__}: {error})"
+                raise DataError(text) from error
+            else:
+                is_new = True
+                self.failures.note(error)
+                self._bank = self._make()
+                with suppress(Exception):  # the repeated question shows it
+                    self._bank.advance(self._now_ns)
             try:
                 return question(self._bank)
-            except DataError:
-                raise
-            except Exception as error:
-                if isinstance(error, MemoryError) and not changes:
-                    raise
-                self.failures.add(Failure.ESTIMATOR_RAISED)
-                if (
-                    isinstance(error, EstimatorError)
-                    and error.causes.keys() & self._alive.keys()
-                ):
-                    self._end(error.causes, Failure.ESTIMATOR_RAISED)
-                elif self._alive:
-                    self._start_over(error)
-                elif is_new:
-                    text = f"the estimator fails even without tracks ({type(error).__name__}: {error})"
-                    raise DataError(text) from error
-                else:
-                    is_new = True
-                    self.failures.note(error)
-                    self._bank = self._make()
-                    with suppress(Exception):  # the repeated question shows it
-                        self._bank.advance(self._now_ns)
+            except Exception as another:
+                error = another
 
     def _end(self, causes: Mapping[int, str | BaseException], failure: Failure) -> None:
         for track_id, cause in causes.items():

@@ -36,7 +36,12 @@ from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states, wrapped
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
-from fgtrack.estimation.object_bank import ObjectBank, Outcomes, changing_nothing
+from fgtrack.estimation.object_bank import (
+    ObjectBank,
+    Outcomes,
+    as_unchanged,
+    changing_nothing,
+)
 from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import MotionModel, WhiteNoise
@@ -208,12 +213,16 @@ class ReplayBank(Stateful):
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
         """Return the outcomes of a stack of measurements."""
-        with changing_nothing(track_ids):
+        try:
             seen = one.seen_by(self._motion)
-            is_outside = [
-                not seen.model.is_compiled or self._rows[each] in self._outside
-                for each in track_ids
-            ]
+            is_plugin = not seen.model.is_compiled
+        except Exception as error:
+            raise as_unchanged(error, track_ids) from error
+        if not is_plugin and not self._outside:
+            return self._fused(stamp_ns, track_ids, seen)
+        is_outside = [
+            is_plugin or self._rows.get(each) in self._outside for each in track_ids
+        ]
         outcomes = Outcomes()
         for chosen in equal_ones(is_outside):
             part, ids = seen, track_ids
@@ -278,30 +287,20 @@ class ReplayBank(Stateful):
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
-        with changing_nothing(track_ids):
-            rows, (m, k) = (
-                np.array(list(map(self._rows.__getitem__, track_ids))),
-                one.z.shape,
-            )
+        try:
+            rows = np.array(list(map(self._rows.__getitem__, track_ids)))
+            m, k = one.z.shape
             if k > self._shape[2]:
                 self._allocate(0, 0, k)
-            y, S, nis, status = written = (
-                np.empty((m, k)),
-                np.empty((m, k, k)),
-                np.empty(m),
-                np.empty(m, dtype=np.int64),
-            )
-            fuse = partial(
-                kernels(_KERNELS).fuse,
-                self._kind,
-                self._noise,
-                self._arrays,
-                rows,
-                (self._lag_ns, self._start_ns, stamp_ns),
-                _stack(one),
-                one.measured,
-            )
-        if not fuse(written):
+            y, S, nis = np.empty((m, k)), np.empty((m, k, k)), np.empty(m)
+            status = np.empty(m, dtype=np.int64)
+            now = self._lag_ns, self._start_ns, stamp_ns
+            seen = _stack(one), one.measured
+            fuse = kernels(_KERNELS).fuse
+        except Exception as error:
+            raise as_unchanged(error, track_ids) from error
+        model, results = (self._kind, self._noise), (y, S, nis, status)
+        if not fuse(*model, self._arrays, rows, now, *seen, results):
             return _results(y, S, nis, status)
         outcomes = Outcomes()
         for is_full in (False, True):

@@ -30,7 +30,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.state import Stateful
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.models.motion import CTRV
 
@@ -106,11 +106,9 @@ class EgoGrowth(Stateful):
         `positions_at` returns x, y and yaw of a state that is extrapolated to a stamp.
         """
         newest, stamp_ns = states[-1], stamps_ns[-1]
-        step_s = (
-            _STEP_S
-            if self._learned_ns is None
-            else seconds(stamp_ns - self._learned_ns)
-        )
+        step_s = _STEP_S
+        if self._learned_ns is not None:
+            step_s = (stamp_ns - self._learned_ns) / NS_PER_S
         if step_s < _STEP_S:
             return
         self._learned_ns = stamp_ns
@@ -123,7 +121,7 @@ class EgoGrowth(Stateful):
             elapsed_ns = stamp_ns - stamps_ns[row]
             if elapsed_ns > longest_ns:
                 continue
-            elapsed_s, older = seconds(elapsed_ns), states[row]
+            elapsed_s, older = elapsed_ns / NS_PER_S, states[row]
             if abs(newest.speed_mps) < _LEAST_SPEED_MPS:
                 moved_m = math.hypot(newest.x_m - older.x_m, newest.y_m - older.y_m)
                 if max(moved_m / elapsed_s, abs(older.speed_mps)) < _LEAST_SPEED_MPS:
@@ -152,7 +150,7 @@ class EgoGrowth(Stateful):
         spacing_s = 0.0
         if recent and stamp_ns - recent[0][0] >= _SPACING_NS:
             before_ns, before = recent[0]
-            spacing_s = seconds(stamp_ns - before_ns)
+            spacing_s = (stamp_ns - before_ns) / NS_PER_S
         for row, (new, old) in enumerate(zip(found, before, strict=True)):
             if not math.isfinite(new):
                 continue
@@ -175,7 +173,9 @@ class EgoGrowth(Stateful):
             (self._fading, _FORGET_SOON_S),
         ):
             keep = math.exp(-weight_s / memory_s)
-            sums[:] = [[keep * each for each in row] for row in sums]
+            for row in sums:
+                for k, each in enumerate(row):
+                    row[k] = keep * each
 
     def _of(self, duration_s: float) -> tuple[FloatArray, FloatArray]:
         """Return mean square and correlation time of acceleration and yaw acceleration over a duration, shape (2,)."""
