@@ -5,12 +5,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from traceback import format_exception
-from types import TracebackType
 from typing import Any, ClassVar
 
 from fgtrack.core.state import Stateful
 
-__all__ = ["Containment", "EstimatorError", "Failure", "Failures"]
+__all__ = ["EstimatorError", "Failure", "Failures"]
 
 
 class Failure(StrEnum):
@@ -109,37 +108,3 @@ class Failures(Stateful):
             "first_failure": self.first,
             "ended_by_failure": list(self.ended),
         }
-
-
-class Containment:
-    """Context of a step: what the step raises is counted, and the work goes on without the step.
-
-    One context serves many steps, also nested ones. It is a class because a generator takes three times as long.
-    """
-
-    __slots__ = ("_failure", "_failures", "_propagated")
-
-    def __init__(
-        self,
-        failures: Failures,
-        failure: Failure,
-        propagated: tuple[type[Exception], ...],
-    ) -> None:
-        """Count as `failure`. Exceptions of the types `propagated`, and interrupts, leave the context."""
-        self._failures, self._failure = failures, failure
-        self._propagated = propagated
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> bool:
-        if not isinstance(error, Exception) or isinstance(error, self._propagated):
-            return False
-        self._failures.add(self._failure)
-        self._failures.note(error)
-        return True

@@ -35,8 +35,9 @@ from fgtrack.tracking.lives.counters import (
 )
 from fgtrack.tracking.lives.latency import FOREVER
 from fgtrack.tracking.objects import Apart
+from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
-from fgtrack.tracking.tracker import Tracker, TrackerParts
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 
 class PublishedEgo(EgoTrajectory):
@@ -343,7 +344,7 @@ class PublishedLifecycle(CountingLifecycle):
         return []
 
 
-class PublishedTracker(Tracker):
+class PublishedTracker(MultiObjectTracker):
     """Tracker with the processing order of the published implementation (defects Q9 and Q22).
 
     A list older than the storage still starts tracks. An empty list ages every track. A
@@ -353,7 +354,7 @@ class PublishedTracker(Tracker):
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
-        *Tracker.STATE,
+        *MultiObjectTracker.STATE,
         "_last_known",
     )
 
@@ -362,7 +363,7 @@ class PublishedTracker(Tracker):
         self._last_known: dict[int, FloatArray] = {}
 
     def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
-        """See `Tracker.tick`."""
+        """See `MultiObjectTracker.tick`."""
         report = super().tick(now_ns, is_last)
         self._remember()
         return report

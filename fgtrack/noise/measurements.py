@@ -36,13 +36,13 @@ from fgtrack.tracking.facing import SIGNED, Facings
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart
+from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import (
     Candidate,
     Candidates,
     Preprocessed,
     Preprocessing,
 )
-from fgtrack.tracking.tracker import TrackerParts
 
 _GATE_PROBABILITY = 0.9999
 

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from fgtrack.core.types import FloatArray
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
-from fgtrack.noise.likelihood.reference import FilterStep, filtered
+from fgtrack.noise.likelihood.reference import FilteredObservation, filtered
 from fgtrack.noise.likelihood.series import Observation, positive_part
 from fgtrack.tracking.preprocess import StampError
 
@@ -85,7 +85,7 @@ def stamp_rates(problem: Problem, values: FloatArray) -> Rates:
     """
     error = StampError(problem.space.motion_model(values), 1.0)
 
-    def rate(step: FilterStep) -> FloatArray:
+    def rate(step: FilteredObservation) -> FloatArray:
         own = step.observation.measurement
         return error.rate(own.model, own.pose, step.after)[
             list(step.observation.measured)

@@ -43,8 +43,9 @@ from fgtrack.tracking.lives.existence import (
     Lifecycle,
 )
 from fgtrack.tracking.lives.latency import Watermarks
+from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocess
-from fgtrack.tracking.tracker import Tracker, TrackerParts
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 #: Stored ego states of the published implementation.
 _EGO_STORAGE_TICKS = 350
@@ -52,7 +53,7 @@ _EGO_STORAGE_TICKS = 350
 
 def build_tracker(
     config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None
-) -> Tracker:
+) -> MultiObjectTracker:
     """Return the tracker that `config` describes; `observed` may replace its parts."""
     for name, sensor in config.used_sensors.items():
         if not sensor.std:
@@ -95,7 +96,7 @@ def build_tracker(
         road=road,
         watermarks=Watermarks(config.sensors, [EGO]),
     )
-    return (PublishedTracker if published_order else Tracker)(
+    return (PublishedTracker if published_order else MultiObjectTracker)(
         parts if observed is None else observed(parts)
     )
 

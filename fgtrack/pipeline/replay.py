@@ -19,7 +19,8 @@ from fgtrack.meaning.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with_last
 from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run
-from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
+from fgtrack.tracking.parts import TrackerParts, check_sensor
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 #: Longest gap between receipts. Ticks continue during a gap, so a wrong receipt could cause ticks for days.
 _LONGEST_SILENCE_S = 3600.0
@@ -151,7 +152,7 @@ def repeatable(
 
 
 def _drive(
-    tracker: Tracker,
+    tracker: MultiObjectTracker,
     messages: Iterable[Message],
     config: Config,
     writer: RunWriter | MemoryRun,

@@ -1,7 +1,7 @@
 """From the detections of one batch to candidates for association: map frame, on the road, merged."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -13,6 +13,7 @@ from fgtrack.core.geometry import body_point
 from fgtrack.core.linalg import congruence, kernels, symmetrise
 from fgtrack.core.types import (
     BoolArray,
+    Detection,
     Disposition,
     FloatArray,
     IntArray,
@@ -41,7 +42,7 @@ from fgtrack.tracking.detections import (
     move_back,
 )
 from fgtrack.tracking.ego.trajectory import EgoPose
-from fgtrack.tracking.inbox import Batch, record
+from fgtrack.tracking.inbox import Batch, merged_records, record
 
 _FAR_M = 1e6
 _STEP_S = 1e-5  # short enough for any motion, long enough for float64
@@ -193,6 +194,28 @@ class Candidates(Lazy[Candidate]):
             None if position is None else position[1],
             0.0 if group.stamp_error is None else group.stamp_error.std_s,
         )
+
+    def records(
+        self,
+        batch: Batch,
+        positions: Iterable[int],
+        disposition: Disposition,
+        track_id: int | None = None,
+    ) -> list[tuple[UpdateRecord, ...]]:
+        """Return the records of candidates of `batch`, each with those of the detections that were merged into it."""
+        message = batch.message
+        return [
+            (
+                record(message, leader, disposition, track_id),
+                *merged_records(message, self.merged.get(leader, ()), track_id),
+            )
+            for leader in [self.leaders[position] for position in positions]
+        ]
+
+    def described(self, batch: Batch, position: int) -> list[Detection]:
+        """Return the detections of `batch` that describe the object of a candidate."""
+        leader, objects = self.leaders[position], batch.message.objects
+        return [objects[index] for index in (leader, *self.merged.get(leader, ()))]
 
     def split(self, chosen: IntArray) -> list[tuple[Group, IntArray, IntArray]]:
         """Return the groups, and of those of the candidates `chosen` (p,) in each the indices there and here."""

@@ -209,7 +209,7 @@ def test_an_exception_after_a_checkpoint_changes_nothing(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(tracker._tracker, "_estimate", broken)
+        patch.setattr(tracker._tracker._update, "fuse", broken)
         with pytest.raises(KeyboardInterrupt):
             gone_on(tracker, after)
     tracker.restore(checkpoint)
@@ -237,6 +237,10 @@ OWN = {
     "_read",
     "_seen",
     "_parts",
+    "_association",
+    "_update",
+    "_starts",
+    "_publication",
     "delays",
     "arrays",
     "seen",

@@ -20,7 +20,7 @@ from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.public import replay, simulate
 from fgtrack.tracking.lives.existence import ExistenceRules
-from fgtrack.tracking.tracker import check_sensor
+from fgtrack.tracking.parts import check_sensor
 
 POINT = Detection(x_m=20.0, y_m=1.0)
 

@@ -20,7 +20,7 @@ from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.lives.counters import LifecycleRules
 from fgtrack.tracking.lives.existence import ExistenceRules
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 AT_M = np.array([40.0, 10.0])
 LIVES: list[LifecycleRules | ExistenceRules] = [
@@ -36,7 +36,7 @@ SENSORS = {
 
 def tracker(
     lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENSORS["camera"]
-) -> Tracker:
+) -> MultiObjectTracker:
     motion = (
         Config().motion
         if estimator == "ekf-backward-forward"
@@ -53,7 +53,7 @@ def tracker(
     return build_tracker(config)
 
 
-def look(tracker: Tracker, sensor: str, at_ms: float) -> TickReport:
+def look(tracker: MultiObjectTracker, sensor: str, at_ms: float) -> TickReport:
     """What the tracker makes of a list with one detection of the object, which stands still."""
     now_ns = START_NS + ms(at_ms)
     tracker.receive(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))

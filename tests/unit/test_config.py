@@ -12,7 +12,7 @@ from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.rglob("*.yaml"))
@@ -96,7 +96,7 @@ def test_every_configuration_can_be_built(path: Path) -> None:
     config = load(Config, path)
     tracker = build_tracker(config)
     assert type(tracker) is (
-        PublishedTracker if config.lifecycle.kind == "published" else Tracker
+        PublishedTracker if config.lifecycle.kind == "published" else MultiObjectTracker
     )
 
 

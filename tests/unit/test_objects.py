@@ -11,12 +11,12 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.public import replay
 from fgtrack.tracking.objects import Objects
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 POINTS = SensorModel(std={"x_m": 0.5, "y_m": 0.5})
 
 
-def tracker(config: Config | None = None) -> Tracker:
+def tracker(config: Config | None = None) -> MultiObjectTracker:
     return build_tracker(replace(config or Config(), sensors={"lidar": POINTS}))
 
 
@@ -25,7 +25,7 @@ def one_list(k: int, *objects: Detection) -> DetectionList:
     return DetectionList("lidar", stamp_ns, stamp_ns, objects, "map")
 
 
-def seen(one: Tracker, k: int, *objects: Detection) -> TickReport:
+def seen(one: MultiObjectTracker, k: int, *objects: Detection) -> TickReport:
     message = one_list(k, *objects)
     one.receive(message)
     return one.tick(message.stamp_ns)

@@ -17,7 +17,7 @@ from fgtrack.core.types import (
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.5, "y_m": 0.5}),
@@ -41,12 +41,12 @@ ESTIMATORS = (
 
 def tracker(
     estimator: str, association: GatedEuclidean | GatedMahalanobis | None = None
-) -> Tracker:
+) -> MultiObjectTracker:
     own = association or GatedMahalanobis()
     return build_tracker(Config(estimator, sensors=SENSORS, association=own))
 
 
-def look(one: Tracker, sensor: str, at_ms: float) -> TickReport:
+def look(one: MultiObjectTracker, sensor: str, at_ms: float) -> TickReport:
     """What the tracker makes of a list with a detection of each object, in reversed order from the Doppler sensor."""
     now_ns, at_s = START_NS + ms(at_ms), 1e-3 * at_ms
     covariance = tuple(np.diag([0.01, 0.01, 1e-4, 0.01, 1e-4]).ravel().tolist())

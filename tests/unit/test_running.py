@@ -115,7 +115,7 @@ def test_a_list_whose_processing_raises_ends_as_failed(
         raise KeyError("a defect")
 
     with monkeypatch.context() as patch:
-        patch.setattr("fgtrack.tracking.tracker.Tracker._estimate", broken)
+        patch.setattr("fgtrack.tracking.list_update.ListUpdate.fuse", broken)
         late_ns = NOW_NS + 1_000 * MS
         tracker.receive(
             DetectionList(

@@ -21,13 +21,13 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.lives.counters import LifecycleRules
 from fgtrack.tracking.lives.existence import ExistenceRules
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 CLAIMING = LifecycleRules(suppress_births_near_newer_tracks=True)
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 
-def tracker(**sensors: SensorModel) -> Tracker:
+def tracker(**sensors: SensorModel) -> MultiObjectTracker:
     return build_tracker(replace(paper(), sensors=sensors or {"lidar": POINTS}))
 
 
@@ -44,7 +44,7 @@ def seen(
 
 
 def tick(
-    tracker: Tracker, at_ms: float, *messages: DetectionList | EgoState
+    tracker: MultiObjectTracker, at_ms: float, *messages: DetectionList | EgoState
 ) -> TickReport:
     for message in messages:
         tracker.receive(message)

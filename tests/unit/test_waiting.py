@@ -11,7 +11,7 @@ from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.live import Tracker as LiveTracker
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.1, "y_m": 0.1}),
@@ -29,13 +29,15 @@ def ego(stamp_ms: float, receipt_ms: float | None = None) -> EgoState:
     )
 
 
-def tracker(**settings: object) -> Tracker:
+def tracker(**settings: object) -> MultiObjectTracker:
     return build_tracker(
         CONFIG.replace({f"ego.{name}": value for name, value in settings.items()})
     )
 
 
-def seen(one: Tracker, now_ms: float, *messages: EgoState | DetectionList) -> list[str]:
+def seen(
+    one: MultiObjectTracker, now_ms: float, *messages: EgoState | DetectionList
+) -> list[str]:
     """Dispositions of a tick that takes `messages`."""
     for each in messages:
         one.receive(each)

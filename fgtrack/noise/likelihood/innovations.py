@@ -20,7 +20,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import correct, propagated
 from fgtrack.noise.likelihood.contaminated import update
-from fgtrack.noise.likelihood.reference import FilterStep, filtered
+from fgtrack.noise.likelihood.reference import FilteredObservation, filtered
 from fgtrack.noise.likelihood.series import NoiseSpace, Series
 
 
@@ -57,7 +57,9 @@ class Innovations:
         a = max(len(step.assumed[0]) for track in steps for step in track)
 
         def padded(
-            value: Callable[[FilterStep], ArrayLike], *size: int, fill: ArrayLike = 0.0
+            value: Callable[[FilteredObservation], ArrayLike],
+            *size: int,
+            fill: ArrayLike = 0.0,
         ) -> FloatArray:
             """Array (k, t, *size) of a value of each step, filled with `fill` beyond the end of a series."""
             array = np.full((max(map(len, steps)), len(steps), *size), fill)

@@ -22,8 +22,8 @@ _MARGIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class FilterStep:
-    """Filter step of one observation; d and a are its numbers of measured and assumed components."""
+class FilteredObservation:
+    """An observation and the filter before and after it; d and a are its numbers of measured and assumed components."""
 
     observation: Observation
     since_s: float
@@ -50,7 +50,7 @@ class FilterStep:
 
 def filtered(
     series: Series, space: NoiseSpace, values: Sequence[float] | FloatArray
-) -> list[FilterStep]:
+) -> list[FilteredObservation]:
     """Run the filter along `series` with the noise parameters `values`, shape (p,); return its steps."""
     motion = space.motion_model(values)
     yawed = "yaw_rad" in motion.state_names
@@ -92,7 +92,7 @@ def filtered(
             after, P = updated_one(after, P, left, H[there], R_assumed)[:2]
         assumed = y[there], H[there], R_assumed
         steps.append(
-            FilterStep(
+            FilteredObservation(
                 observation,
                 since_s,
                 x,

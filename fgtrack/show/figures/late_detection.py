@@ -22,7 +22,7 @@ from fgtrack.runs import Run, load_run
 from fgtrack.show.figures.close_up import STEP_S, Arrival, CloseUp, Estimates
 from fgtrack.show.figures.close_up import close_up as figure_of
 from fgtrack.show.figures.paper import Paper
-from fgtrack.tracking.tracker import Tracker
+from fgtrack.tracking.tracker import MultiObjectTracker
 
 # The estimates begin this time before the detection.
 _BACK_S = 0.15
@@ -159,7 +159,9 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
     raise DataError(f"{name}: the recording has no such list")
 
 
-def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
+def _estimates(
+    tracker: MultiObjectTracker, track_id: int, stamps_ns: Iterable[int]
+) -> Estimates:
     """Return the states at the descending `stamps_ns`, back to the start of the track's window."""
     states = []
     for stamp_ns in stamps_ns:

@@ -1,0 +1,154 @@
+"""What a tracker knows of its tracks beside states, lives and objects: numbers, and first positions."""
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import ClassVar
+
+import numpy as np
+
+from fgtrack.core.state import Stateful
+from fgtrack.core.types import BoolArray, Detection, IntArray
+from fgtrack.estimation.base import Measurements, Start, StatesAt, UpdateResult
+from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.filters.ekf import correct_one
+from fgtrack.tracking.birth import in_any_direction
+from fgtrack.tracking.lives.latency import FOREVER, NEVER
+from fgtrack.tracking.parts import TrackerParts
+
+
+class Tracks(Stateful):
+    """Numbers of the tracks, of the detections that have changed their states, and their first positions."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_next_id",
+        "num_measured",
+        "_undirected",
+        "_directed",
+        "_newborn",
+    )
+
+    def __init__(self, parts: TrackerParts) -> None:
+        self._parts = parts
+        self._next_id = 0
+        self.num_measured = Counter[int]()
+        """Number of detections that have changed the state, by track."""
+        # Of tracks with one position and an unknown heading, by id.
+        self._undirected: dict[int, Start] = {}
+        # Of the tracks that have a second position since, and its stamp.
+        self._directed: dict[int, tuple[Start, int]] = {}
+        # Sensors of first positions, and stamps of second ones, by id.
+        self._newborn: dict[int, tuple[str, int]] = {}
+
+    def number(self, detection: Detection) -> int:
+        """Return the number of a new track. A former track with the identity of `detection` passes on its number."""
+        track_id = self._parts.objects.former(detection)
+        if track_id is None:
+            self._next_id += 1
+            return self._next_id - 1
+        if track_id in self.num_measured:  # lost
+            self._parts.objects.id_conflicts["reused"] += 1
+            self.end([track_id])
+        return track_id
+
+    def begin(self, track_id: int, sensor: str, prior: Start) -> None:
+        """Note a track that a first detection of `sensor` has started."""
+        if prior.yaw_rad is None and not self._parts.motion.cartesian:
+            self._undirected[track_id] = prior
+        self.num_measured[track_id] = 1
+        self._newborn[track_id] = sensor, FOREVER
+
+    def end(self, track_ids: Sequence[int]) -> None:
+        """End tracks. A track whose end raises is forgotten as well, and the remaining tracks still end."""
+        parts = self._parts
+        for track_id in track_ids:
+            self._undirected.pop(track_id, None)
+            self._directed.pop(track_id, None)
+            self._newborn.pop(track_id, None)
+            self.num_measured.pop(track_id, None)
+            facing = () if parts.facing is None else (parts.facing.forget,)
+            for forget in (
+                parts.bank.remove,
+                parts.objects.forget,
+                *facing,
+                parts.lifecycle.forget,
+            ):
+                try:
+                    forget(track_id)
+                except Exception as error:
+                    parts.contain(error, Failure.STEP_FAILED)
+
+    def forget_first(self, oldest_ns: int) -> None:
+        """Forget the first positions of tracks whose second one no late list can precede."""
+        if self._newborn:
+            self._newborn = {
+                i: each for i, each in self._newborn.items() if each[1] >= oldest_ns
+            }
+        if self._directed:
+            self._directed = {
+                i: each for i, each in self._directed.items() if each[1] >= oldest_ns
+            }
+
+    def is_undirected(self, track_id: int) -> bool:
+        """True of a track with one position and an unknown heading."""
+        return track_id in self._undirected
+
+    def in_any_direction(self, states: StatesAt, stamp_ns: int) -> StatesAt:
+        """Return `states` at `stamp_ns`, those without a second position as uncertain in any direction."""
+        if not (self._undirected or self._directed):
+            return states
+        return in_any_direction(states, stamp_ns, self._undirected, self._directed)
+
+    def newborn_of_others(
+        self, sensor: str, stamp_ns: int, track_ids: Sequence[int]
+    ) -> BoolArray | None:
+        """True of tracks with one position so far, or up to the stamp, of a list of another sensor, shape (m,).
+
+        The next list of that sensor shows the object again. Until then its velocity is unknown, and the gate wide.
+        None where there is no such track.
+        """
+        if not self._newborn:
+            return None
+        first = [self._newborn.get(each, (sensor, NEVER)) for each in track_ids]
+        others = [
+            name != sensor and self._parts.sensors[name].scan and stamp_ns < until_ns
+            for name, until_ns in first
+        ]
+        return np.array(others, dtype=bool) if any(others) else None
+
+    def placed(
+        self,
+        measurements: Measurements,
+        of: IntArray,
+        states: StatesAt,
+        results: Sequence[UpdateResult],
+    ) -> None:
+        """Count the fused ones of these measurements, which give positions, for the lives of their tracks.
+
+        `of` (m,) are the indices of the tracks in `states`.
+        """
+        ids = [states.track_ids[track] for track in of.tolist()]
+        fused = [row for row, each in enumerate(results) if each.innovation is not None]
+        if len(fused) == len(ids):
+            self._parts.lifecycle.fused(ids)
+        else:
+            self._parts.lifecycle.fused([ids[row] for row in fused])
+        if not (self._newborn or self._directed or self._undirected):
+            return
+        stamp_ns = measurements.stack.stamp_ns
+        for row in fused:
+            track_id = ids[row]
+            if track_id in self._newborn:
+                name, until_ns = self._newborn[track_id]
+                self._newborn[track_id] = name, min(until_ns, stamp_ns)
+            if track_id in self._directed:
+                start, until_ns = self._directed[track_id]
+                self._directed[track_id] = start, min(until_ns, stamp_ns)
+            if track_id in self._undirected:
+                self._directed[track_id] = self._undirected.pop(track_id), stamp_ns
+                # The estimator's prior, linearised along an unknown direction, spreads along it alone.
+                seen, track = measurements[row].seen_by(self._parts.motion), of[row]
+                with suppress(np.linalg.LinAlgError):
+                    results[row].nis = correct_one(
+                        states.means[track], states.covariances[track], seen
+                    ).nis
