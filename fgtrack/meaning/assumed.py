@@ -15,6 +15,7 @@ from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.inputs.source import InputSource
 from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
+from fgtrack.meaning.components import uninformative
 from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
@@ -46,6 +47,8 @@ _LARGEST_SHARE = 0.99
 _OFFSET_S = 30.0
 _HULLS = 2.0 * math.sqrt(12.0)
 """Length of a long hull, divided by the standard deviation on each axis of the difference of two of its detections."""
+_FIRST_MESSAGES = 20_000
+"""Number of messages by which components without information are recognised."""
 _LONGEST_S = 60.0
 """Longest window."""
 #: Standard deviation per step at 100 Hz, which is a density of 225 m^2/s^3. The density of Singer's model (Estimating
@@ -162,6 +165,8 @@ def _covered(
 ) -> Coverages:
     """Coverage of all sensors in the recording or in `config.input`, without ignored sensors."""
 
+    first: list[Message] = []
+
     def readable() -> Iterator[Message]:
         with suppress(DataError):  # the replay ends there too, and reports the error
             for message in source.messages():
@@ -169,11 +174,19 @@ def _covered(
                     isinstance(message, DetectionList)
                     and message.sensor in config.ignore_sensors
                 ):
+                    if len(first) < _FIRST_MESSAGES:
+                        first.append(message)
                     yield message
 
     named = set(config.input.detections) | set(config.input.csv.detections)
     result = {name: Coverage() for name in named.difference(config.ignore_sensors)}
-    return dict(sorted((result | coverages(readable(), mounts)).items()))
+    result |= coverages(readable(), mounts)
+    for name, reasons in uninformative(first, mounts).items():
+        informative = result[name].measured - reasons.keys()
+        result[name] = replace(
+            result[name], measured=informative, uninformative=reasons
+        )
+    return dict(sorted(result.items()))
 
 
 def _sensor(name: str, reason: str, **settings: object) -> Iterator[Assumption]:
@@ -246,7 +259,12 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
             for component in MEASURABLE
             if component in components
         }
-        yield from _sensor(name, USUAL_BOX if item.boxes else USUAL, std=std)
+        reason = USUAL_BOX if item.boxes else USUAL
+        left_out = [
+            f"{component} is not used: {why}"
+            for component, why in item.uninformative.items()
+        ]
+        yield from _sensor(name, "; ".join([reason, *left_out]), std=std)
 
 
 def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:

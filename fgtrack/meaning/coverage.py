@@ -4,7 +4,7 @@ import math
 from array import array
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from statistics import median
 
@@ -81,7 +81,9 @@ class Coverage:
     """Coverage and lists of a sensor; the defaults describe a sensor without messages."""
 
     measured: frozenset[str] = frozenset()
-    """Components that the detections contain."""
+    """Components that the detections contain, without `uninformative` ones."""
+    uninformative: Mapping[str, str] = field(default_factory=dict)
+    """Measured components that are no measurements, with the reason."""
     num_lists: int = 0
     num_detections: int = 0
     boxes: bool = False
@@ -220,9 +222,9 @@ class _Detections:
         singles = np.count_nonzero(counts == 1)
         result = Coverage(
             frozenset(self.measured),
-            num_lists,
-            int(counts.sum()),
-            self.boxes,
+            num_lists=num_lists,
+            num_detections=int(counts.sum()),
+            boxes=self.boxes,
             rate_hz=(num_lists - 1) / span_s if span_s > 0.0 else None,
             silence_s=float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0)),
             scans=not has_enough_lists

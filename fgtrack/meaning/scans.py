@@ -4,9 +4,11 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Message
 from fgtrack.meaning.motions import Scans
+from fgtrack.models.sensors import Mount
 
 __all__ = ["scans_of"]
 
@@ -20,12 +22,15 @@ def scans_of(
     messages: Iterable[Message],
     sensor: str,
     values: Callable[[Detection], Sequence[float | None]],
+    mount: Mount | None = None,
+    around_ego: bool = False,
 ) -> Scans | None:
     """Return the scans of `sensor`, with the raw `values` of each detection; None if they cannot be evaluated.
 
-    Positions are x and y, or range and bearing. The pose is the ego's, or that of the map
-    for lists in the map. Lists without an ego state near them are left out. Lists of one
-    stamp are joined.
+    Positions are x and y, or range and bearing. The pose is the ego's, the `mount` on the
+    ego for lists in the frame of the sensor, or the map's. With `around_ego`, lists in the
+    map are converted to the frame of the ego, if it is known. Lists without an ego state
+    near them are left out. Lists of one stamp are joined.
     """
     lists: dict[int, list[DetectionList]] = {}
     ego: list[tuple[float, float, float, float]] = []
@@ -44,13 +49,16 @@ def scans_of(
     stamps_ns = sorted(lists)[:_MOST_LISTS]
     stamps_s = np.array([(stamp_ns - first_ns) / NS_PER_S for stamp_ns in stamps_ns])
     poses = np.zeros((len(stamps_s), 3))
-    if frames != {"map"}:
-        path = _path(np.array(ego).reshape(-1, 4))
-        if len(frames) != 1 or path is None:
-            return None
+    path = _path(np.array(ego).reshape(-1, 4))
+    in_map = frames == {"map"}
+    if not in_map and (len(frames) != 1 or path is None):
+        return None
+    if path is not None and (around_ego or not in_map):
         poses = np.column_stack(
             [np.interp(stamps_s, path[:, 0], column) for column in path.T[1:]]
         )
+        if frames == {"sensor"} and mount is not None:
+            poses = _mounted(poses, mount)
         after = np.searchsorted(path[:, 0], stamps_s).clip(1, len(path) - 1)
         gaps_s = np.minimum(
             np.abs(path[after, 0] - stamps_s), np.abs(path[after - 1, 0] - stamps_s)
@@ -61,7 +69,7 @@ def scans_of(
         poses = poses[kept]
     positions = []
     raw = []
-    width = 1
+    width = len(values(Detection()))
     for stamp_ns in stamps_ns:
         rows = [
             (*at, *[np.nan if one is None else one for one in values(item)])
@@ -69,12 +77,28 @@ def scans_of(
             for item in each.objects
             if (at := _position_m(item)) is not None
         ]
-        table = np.array(rows, dtype=np.float64) if rows else np.zeros((0, 2))
-        width = max(width, table.shape[1] - 2)
-        positions.append(table[:, :2].reshape(-1, 2))
+        table = np.array(rows, dtype=np.float64).reshape(len(rows), 2 + width)
+        positions.append(table[:, :2])
         raw.append(table[:, 2:])
-    raw = [one if len(one) else np.zeros((0, width)) for one in raw]
+    if in_map:
+        positions = [
+            (points_m - pose[:2]) @ rotation(pose[2])
+            for points_m, pose in zip(positions, poses, strict=True)
+        ]
     return Scans(stamps_s, positions, raw, poses)
+
+
+def _mounted(poses: FloatArray, mount: Mount) -> FloatArray:
+    """Poses of the sensor in the map, shape (n, 3), for `poses` of the ego."""
+    c = np.cos(poses[:, 2])
+    s = np.sin(poses[:, 2])
+    return np.column_stack(
+        [
+            poses[:, 0] + c * mount.x_m - s * mount.y_m,
+            poses[:, 1] + s * mount.x_m + c * mount.y_m,
+            poses[:, 2] + mount.yaw_rad,
+        ]
+    )
 
 
 def _path(ego: FloatArray) -> FloatArray | None:

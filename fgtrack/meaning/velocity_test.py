@@ -98,8 +98,14 @@ def _meaning(
     for component, one in zip(_VELOCITIES, paths, strict=False):
         columns[component] = Field(one, unknown=unknown)
     values = (lambda item: (item.speed_mps,)) if len(paths) == 1 else _pair
+    sensor = sample.config.sensors.get(name)
+    mount = None if sensor is None else sensor.mount
     scans = scans_of(
-        sample.read(_with_mapping(sample.config, name, columns)), name, values
+        sample.read(_with_mapping(sample.config, name, columns)),
+        name,
+        values,
+        mount,
+        around_ego=True,
     )
     if scans is None:
         return VelocityMeaning(
