@@ -53,8 +53,8 @@ FieldPath = str | Sequence[str] | Field
 class TopicInput:
     """One topic of a recording."""
 
-    topic: str
-    """Name of the topic."""
+    topic: str = ""
+    """Name of the topic. Empty: the draft of a recording names it, and the other keys stay as given."""
     frame: Frame | Literal["optical"] | None = None
     """Frame of the positions; `optical` is a sensor frame with x to the right, y down and z forward.
 
@@ -99,7 +99,7 @@ class TopicInput:
 class CsvTable:
     """A CSV file, or some rows of a file that contains several sensors or kinds."""
 
-    columns: Mapping[str, FieldPath]
+    columns: Mapping[str, FieldPath] = field(default_factory=dict)
     """Columns of `stamp`, `receipt` (by default the stamp), `object_id` and each component, as in `fields`.
 
     Two columns of a time are whole seconds and nanoseconds, which are added: `stamp:

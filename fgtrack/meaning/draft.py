@@ -1,14 +1,16 @@
 """Draft of the settings of a recording: what its numbers mean, how sure that is, and what remains to be asked."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from fgtrack.config.recorded import recorded
 from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.checks import check_paths
-from fgtrack.core.errors import DataError, FgtrackError
+from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.types import Message
 from fgtrack.inputs.formats.native import NATIVE_ADAPTERS
 from fgtrack.inputs.formats.tables import headers
@@ -156,7 +158,7 @@ def opened(recording: Path | str, config: Config | None = None) -> Draft:
     mapped = given
     if _is_unmapped(given.input) and kind in ("csv", "recording"):
         parts, unused = _mapped(path, kind)
-        mapped = replace(given, input=_with_parts(given.input, parts))
+        mapped = _overlaid(replace(given, input=_with_parts(given.input, parts)), given)
         if not parts and unused:
             source = _unreadable(path, kind, unused)
             return Draft(source, Assumed(given), unused=unused)
@@ -166,7 +168,7 @@ def opened(recording: Path | str, config: Config | None = None) -> Draft:
     if not parts:
         settled = {name for name, item in given.sensors.items() if item.std}
     if parts or not settled or unmodelled_sensors(given, _named(given.input)):
-        mapped, tested = decided(path, given, mapped, settled)
+        mapped, tested = decided(path, _with_mounts(given, source), mapped, settled)
         decisions += tested
         source = open_input(path, mapped.input)
     draft = Draft(
@@ -191,13 +193,58 @@ def opened_together(
 
 
 def _is_unmapped(config: InputConfig) -> bool:
-    """True if `config` maps neither a topic nor a table."""
-    return (
-        config.ego is None
-        and not config.detections
-        and not config.truth
-        and config.csv == CsvInput()
+    """True if `config` names neither a topic nor the columns of a table."""
+    topics = [config.ego, *config.detections.values()]
+    topics += config.truth if isinstance(config.truth, tuple) else [config.truth]
+    tables = [config.csv.ego, config.csv.truth, *config.csv.detections.values()]
+    return not any(one and one.topic for one in topics) and not any(
+        one and one.columns for one in tables
     )
+
+
+def _with_mounts(given: Config, source: InputSource) -> Config:
+    """Return `given` with the mounts that the recording carries, which need no test."""
+    raw = plain(given)
+    for name, sensor in recorded(source).sensors.items():
+        if sensor.mount is not None:
+            path = ("sensors", name, "mount")
+            raw = with_value(raw, path, plain(sensor.mount))
+    return validate(Config, raw, "recorded")
+
+
+def _overlaid(config: Config, given: Config) -> Config:
+    """Return `config` with the keys of topics and tables that `given` contains.
+
+    Raises `CallError` for a topic or table that the draft does not contain.
+    """
+    raw = plain(config)
+    for path in _leaves(departures(given.input), ("input",)):
+        known: object = raw
+        for name in path[:-1]:
+            known = known.get(name) if isinstance(known, Mapping) else None
+        if known is None:
+            raise CallError(
+                f"{'.'.join(path)}: the draft of the recording has no such topic or table; "
+                "its names are shown by `fgtrack info RECORDING --write`"
+            )
+        value: object = plain(given)
+        for name in path:
+            value = value[name]  # type: ignore[index]  # a path of nested mappings
+        raw = with_value(raw, path, value)
+    return validate(Config, raw, "drafted")
+
+
+def _leaves(values: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield the paths of the keys of topics and tables in nested mappings."""
+    if not isinstance(values, Mapping):
+        yield path
+        return
+    for name, value in values.items():
+        is_role = path[-1] in ("ego", "truth", "detections", "csv", "input")
+        if is_role or path[-2:-1] == ("detections",):
+            yield from _leaves(value, (*path, name))
+        else:
+            yield (*path, name)
 
 
 def _named(config: InputConfig) -> set[str]:

@@ -1,6 +1,7 @@
 """A recording without settings: names suggest, tests decide, and what stays open is asked."""
 
 import csv
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -371,3 +372,39 @@ def test_each_of_several_recordings_gets_a_study_and_an_error_does_not_stop_the_
     assert shown.out.startswith("a: no study error: ")
     assert (tmp_path / "out/drive/report.html").exists()
     assert (tmp_path / "out/other/report.html").exists()
+
+
+def test_one_key_of_a_table_or_topic_may_be_set_without_the_others(tables, bag, tests):
+    for recording, section, name in (
+        (tables, "input.csv.detections", "radar_front"),
+        (bag, "input.detections", "radar_front"),
+    ):
+        given = Config().replace({f"{section}.{name}.frame": "sensor"})
+        draft = drafted(recording, given)
+        frames = {
+            (each.sensor, each.frame)
+            for each in draft.source.messages()
+            if isinstance(each, DetectionList)
+        }
+        assert frames == {("radar_front", "sensor"), ("lidar_rear", "ego")}
+    given = Config().replace({"input.csv.detections.sonar.frame": "sensor"})
+    with pytest.raises(CallError, match=r"sonar.frame: the draft .* has no such"):
+        drafted(tables, given)
+
+
+def test_a_recorded_mount_needs_no_test(tests, tmp_path):
+    asked = []
+
+    def asks(sample):
+        asked.append(sample.is_open(("sensors", "lidar", "mount")))
+        return ()
+
+    tests(asks)
+    fgtrack.simulate("default", duration_s=1.0, out=tmp_path / "a.jsonl")
+    lines = (tmp_path / "a.jsonl").read_text().splitlines(keepends=True)
+    header = json.loads(lines[0])
+    for settings in ({}, {"sensors": {"lidar": {"mount": {"x_m": 2.0}}}}):
+        first = json.dumps(header | {"settings": settings}) + "\n"
+        (tmp_path / "b.jsonl").write_text("".join([first, *lines[1:]]))
+        drafted(tmp_path / "b.jsonl")
+    assert asked == [True, False]

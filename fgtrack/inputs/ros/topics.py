@@ -189,6 +189,8 @@ def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
 
 
 def _find(bag: Bag, item: TopicInput) -> BagTopic:
+    if not item.topic:
+        raise CallError(f"{bag.path}: a topic in `input` has no name: set its `topic`")
     topics = [topic for topic in bag.topics if topic.name == item.topic]
     if len(topics) == 1:
         return topics[0]
