@@ -86,7 +86,10 @@ def _smooth(rng: np.random.Generator, times_s: FloatArray, std: float) -> FloatA
 
 
 def drive(
-    seed: int, sensors: Sequence[Sensor] = NEWCOMER, parked: int = 2, turning: float = 1.0
+    seed: int,
+    sensors: Sequence[Sensor] = NEWCOMER,
+    parked: int = 2,
+    turning: float = 1.0,
 ) -> Drive:
     """Simulate a drive of a minute with eight moving cars and `parked` cars at the roadside."""
     rng = np.random.default_rng(seed)
@@ -99,7 +102,9 @@ def drive(
 
     def on_road(s_m: FloatArray, left_m: FloatArray) -> FloatArray:
         along = [np.interp(s_m, arc_m, ego[:, k]) for k in range(3)]
-        over_m = np.where(s_m > arc_m[-1], s_m - arc_m[-1], np.minimum(s_m - arc_m[0], 0.0))
+        over_m = np.where(
+            s_m > arc_m[-1], s_m - arc_m[-1], np.minimum(s_m - arc_m[0], 0.0)
+        )
         x_m = along[0] + over_m * np.cos(along[2]) - left_m * np.sin(along[2])
         y_m = along[1] + over_m * np.sin(along[2]) + left_m * np.cos(along[2])
         return np.column_stack([x_m, y_m])
@@ -122,10 +127,16 @@ def drive(
         paths.append(on_road(s_m, np.full(len(times_s), -rng.uniform(3.0, 6.0))))
     messages: list[Message] = []
     for t in np.arange(0.0, DURATION_S, 0.02).tolist():
-        x, y, a = _at(ego, times_s, np.array([t]))[0] + rng.normal(size=3) * [0.03, 0.03, 0.002]
+        x, y, a = _at(ego, times_s, np.array([t]))[0] + rng.normal(size=3) * [
+            0.03,
+            0.03,
+            0.002,
+        ]
         v = float(np.interp(t, times_s, speed))
         messages.append(EgoState(_ns(t), _ns(t + 0.003), x, y, a, v))
-    seen = {item.name: _sense(item, rng, times_s, ego, paths, messages) for item in sensors}
+    seen = {
+        item.name: _sense(item, rng, times_s, ego, paths, messages) for item in sensors
+    }
     messages.sort(key=lambda item: item.receipt_ns)
     return Drive(messages, tuple(sensors), seen)
 
@@ -182,19 +193,24 @@ def _sense(
         frame = {"polar": "sensor"}.get(sensor.form, sensor.form)
         stamp_ns = _ns(float(lists_s[k]))
         receipt_ns = stamp_ns + round(1e9 * rng.gamma(2.0, 0.03))
-        messages.append(DetectionList(sensor.name, stamp_ns, receipt_ns, objects, frame))  # type: ignore[arg-type]
+        messages.append(
+            DetectionList(sensor.name, stamp_ns, receipt_ns, objects, frame)
+        )  # type: ignore[arg-type]
     lists, numbers = np.array(rows, dtype=np.int64).reshape(-1, 2).T
     positions = np.array([true_m[n][k] for k, n in rows]).reshape(-1, 2)
     return Seen(lists_s[lists], numbers, positions, poses[lists])
 
 
-def _detection(sensor: Sensor, item: tuple[float, float], pose: FloatArray) -> Detection:
+def _detection(
+    sensor: Sensor, item: tuple[float, float], pose: FloatArray
+) -> Detection:
     r, b = item
     if sensor.form == "polar":
         return Detection(range_m=r, bearing_rad=b)
     at_m = np.array([[r * math.cos(b), r * math.sin(b)]])
     if sensor.form != "sensor":
-        at_m = _turned(at_m, np.array([sensor.yaw_rad])) + [[sensor.x_m, sensor.y_m]]
+        at_m = _turned(at_m, np.array([sensor.yaw_rad]))
+        at_m = at_m + np.array([sensor.x_m, sensor.y_m])
     if sensor.form == "map":
         at_m = _turned(at_m, pose[2:]) + pose[:2]
     return Detection(x_m=float(at_m[0, 0]), y_m=float(at_m[0, 1]))
@@ -216,11 +232,15 @@ def bound(one: Drive) -> FloatArray:
         W = np.concatenate([part[2] for part in parts])
         if len(times_s) < 5:
             continue
-        knots = np.arange(times_s.min() - 3.5 * KNOT_S, times_s.max() + 4.5 * KNOT_S, KNOT_S)
+        knots = np.arange(
+            times_s.min() - 3.5 * KNOT_S, times_s.max() + 4.5 * KNOT_S, KNOT_S
+        )
         B = BSpline.design_matrix(times_s, knots, 3).toarray()
         B = B[:, np.abs(B).sum(axis=0) > 1e-9]
         D = np.einsum("nm,ij->nimj", B, np.eye(2)).reshape(2 * len(B), -1)
-        WD = np.einsum("nij,njm->nim", W, D.reshape(len(B), 2, -1)).reshape(2 * len(B), -1)
+        WD = np.einsum("nij,njm->nim", W, D.reshape(len(B), 2, -1)).reshape(
+            2 * len(B), -1
+        )
         WA = np.einsum("nij,njk->nik", W, A).reshape(2 * len(B), -1)
         flat = A.reshape(2 * len(B), -1)
         inner = D.T @ WD
@@ -246,7 +266,9 @@ def _jacobian(
     v = np.column_stack([-u[:, 1], u[:, 0]])
     W = u[:, :, None] * u[:, None, :] / along[:, None, None] ** 2
     W = W + v[:, :, None] * v[:, None, :] / across[:, None, None] ** 2
-    turns = np.stack([_turned(np.tile(axis, (len(r), 1)), poses[:, 2]) for axis in np.eye(2)], axis=2)
+    turns = np.stack(
+        [_turned(np.tile(axis, (len(r), 1)), poses[:, 2]) for axis in np.eye(2)], axis=2
+    )
     A = np.zeros((len(r), 2, 3 * (len(one.sensors) - 1)))
     if k:
         columns = slice(3 * k - 2, 3 * k)

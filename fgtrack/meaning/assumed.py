@@ -315,7 +315,8 @@ def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
     a shore or a moored ship.
     """
     largest_m = max(
-        (item.disagreement_m or 0.0 for item in covered.values()), default=0.0
+        (item.disagreement_m or 0.0 for item in covered.values() if _is_common(item)),
+        default=0.0,
     )
     if largest_m <= ASSUMED_STD["x_m"]:
         return
@@ -331,6 +332,12 @@ def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
         yield Assumption(("lifecycle", "min_travel_m"), travel_m, reason)
 
 
+def _is_common(one: Coverage) -> bool:
+    """True if a sensor disagrees with another one by more than the independent errors of both explain."""
+    share = one.unexplained_m**2 / max((one.disagreement_m or 0.0) ** 2, 1e-12)
+    return share >= _LEAST_SHARE
+
+
 def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield time-correlated errors of sensors that disagree by more than their independent errors explain.
 
@@ -340,6 +347,8 @@ def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
     for name, one in covered.items():
         std = config.sensors[name].std
         if one.disagreement_m is None or one.persistence is None or "x_m" not in std:
+            continue
+        if not _is_common(one):
             continue
         independent_m = max(std["x_m"], one.persistence.std_m)
         std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")

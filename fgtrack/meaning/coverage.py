@@ -106,6 +106,8 @@ class Coverage:
     """Persistence of the detections from list to list; None if too few recur."""
     disagreement_m: float | None = None
     """Smallest standard deviation between positions of this sensor and of another one; None without common objects."""
+    unexplained_m: float = 0.0
+    """Part of `disagreement_m` that the independent errors of both sensors do not explain."""
     area_m2: float | None = None
     """Area in which the detections with a range lie, at least the area of the narrowest sector with this range."""
     axis_rad: float = 0.0
@@ -159,13 +161,19 @@ def coverages(
         if item.persistence is not None
     }
     for name, one in measured.items():
-        disagreements_m = [
-            disagreement_m(item, one.lists)
+        pairs = [
+            (distance_m, max(distance_m**2 - one.std_m**2 - item.std_m**2, 0.0))
             for other, item in measured.items()
             if other != name
+            and (distance_m := disagreement_m(item, one.lists)) is not None
         ]
-        smallest_m = min(filter(None, disagreements_m), default=None)
-        result[name] = replace(result[name], disagreement_m=smallest_m)
+        if pairs:
+            smallest_m, unexplained_m2 = min(pairs)
+            result[name] = replace(
+                result[name],
+                disagreement_m=smallest_m,
+                unexplained_m=math.sqrt(unexplained_m2),
+            )
     return result
 
 
@@ -250,7 +258,12 @@ class _Detections:
                 for column in path[:, 1:].T
             )
             if not in_map:
-                map_m = _rotated(seen_m, yaw_rad) + np.column_stack([x_m, y_m])
+                body_m = seen_m
+                if mount is not None and "sensor" in self.frames:
+                    arm_m = np.array([mount.x_m, mount.y_m])
+                    turn_rad = np.full(len(seen_m), mount.yaw_rad)
+                    body_m = _rotated(seen_m, turn_rad) + arm_m
+                map_m = _rotated(body_m, yaw_rad) + np.column_stack([x_m, y_m])
             elif len(ranged):
                 seen_m = _rotated(seen_m - np.column_stack([x_m, y_m]), -yaw_rad)
         if mount is not None and "sensor" not in self.frames:

@@ -8,13 +8,14 @@ from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.types import Message
 from fgtrack.meaning.decision import Decision
+from fgtrack.meaning.placement import frame_decisions, mount_decisions
 from fgtrack.meaning.sample import Sample, Test, first_messages
 from fgtrack.meaning.velocity_test import velocity_decisions
 
 __all__ = ["TESTS", "decided"]
 
 #: Tests in their order: frames, mounts, velocities, times, orientations.
-TESTS: tuple[Test, ...] = (velocity_decisions,)
+TESTS: tuple[Test, ...] = (frame_decisions, mount_decisions, velocity_decisions)
 
 
 def decided(

@@ -16,7 +16,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc, stdtrit
 
 from fgtrack.core.geometry import rotation, rotations, wrap_angle
 from fgtrack.core.linalg import psd_solve
@@ -62,6 +61,7 @@ _SLOWEST_EGO_MPS = 3.0
 _SURE = 0.0005
 _SMALLEST_RAD = 0.005
 _SMALLEST_M = 0.1
+_KNOWN_YAW_RAD = 0.05
 
 
 class Pose2(NamedTuple):
@@ -121,16 +121,38 @@ class MountEstimate:
     @property
     def half_widths(self) -> tuple[float, float, float]:
         """Half widths of the 95 % intervals of yaw, x and y; infinite where unknown."""
-        yaw, x, y = (
-            std * float(stdtrit(dof, 0.975)) if dof >= _FEWEST_DOF else math.inf
-            for std, dof in zip(self.stds, self.dof, strict=True)
-        )
+        dof = np.array(self.dof)
+        half = np.array(self.stds) * _t_quantile(dof, 0.975)
+        yaw, x, y = np.where(dof >= _FEWEST_DOF, half, np.inf).tolist()
         return yaw, x, y
 
     @property
     def is_known(self) -> bool:
         """True if the yaw and the lever arm are estimated."""
         return all(map(math.isfinite, self.half_widths))
+
+    @property
+    def is_sure_of_yaw(self) -> bool:
+        """True if the yaw is known within 0.05 rad (95 %)."""
+        return self.half_widths[0] < _KNOWN_YAW_RAD
+
+    @property
+    def significant_pose(self) -> Pose2:
+        """Yaw, x and y; a lever arm or a yaw whose interval contains 0 is 0."""
+        values = [
+            value if abs(value) > half or not math.isfinite(half) else 0.0
+            for value, half in zip(self.pose, self.half_widths, strict=True)
+        ]
+        return Pose2(*values)
+
+    @property
+    def words(self) -> str:
+        """Yaw and lever arm with their 95 % intervals in words, and the data behind them."""
+        yaw, x, y = self.half_widths
+        return (
+            f"yaw {_within(math.degrees(self.yaw_rad), math.degrees(yaw), 'degrees')}, "
+            f"x {_within(self.x_m, x, 'm')}, y {_within(self.y_m, y, 'm')} ({self.why})"
+        )
 
     def judged(self, assumed: Pose2) -> "MountEstimate":
         """Return the estimate with `is_off`, compared with the `assumed` mount."""
@@ -140,11 +162,14 @@ class MountEstimate:
         return replace(self, is_off=bool(is_off))
 
     def __str__(self) -> str:
-        yaw, x, y = self.half_widths
-        return (
-            f"{self.sensor}: yaw {_within(math.degrees(self.yaw_rad), math.degrees(yaw), 'degrees')}, "
-            f"x {_within(self.x_m, x, 'm')}, y {_within(self.y_m, y, 'm')} ({self.why})"
-        )
+        return f"{self.sensor}: {self.words}"
+
+
+def _t_quantile(dof: FloatArray, share: float) -> FloatArray:
+    """Quantile of Student's t distribution; few degrees of freedom count as `_FEWEST_DOF`."""
+    from scipy.special import stdtrit  # the import takes a tenth of a second
+
+    return np.asarray(stdtrit(np.maximum(dof, _FEWEST_DOF), share))
 
 
 def _within(value: float, half: float, unit: str) -> str:
@@ -504,8 +529,8 @@ class _Table(NamedTuple):
     times_s: FloatArray
     points_m: FloatArray
     poses: FloatArray
-    R: FloatArray
-    """Covariances in the frames of the sensors, shape (n, 2, 2)."""
+    noise: FloatArray
+    """Noise of the sensors, shape (n, 2, 2), as in `Rows`."""
     in_map: BoolArray
 
 
@@ -518,22 +543,18 @@ def _table(sensors: Mapping[str, _Sensor], group: _Group) -> _Table:
         one = sensors[name]
         for k, track in enumerate(one.tracks):
             rows = track.rows[::step]
-            at_m = one.points.points_m[rows]
-            seen_m = at_m
-            if one.points.in_map and np.isfinite(one.points.poses[rows]).all():
-                seen_m = at_m - one.points.poses[rows, :2]
             parts.append(
                 (
                     np.full(len(rows), number),
                     np.full(len(rows), owner[name, k]),
                     track.times_s[::step],
-                    at_m,
+                    one.points.points_m[rows],
                     one.points.poses[rows],
-                    one.noise.covariances(_mean_sights(seen_m)),
+                    np.tile([one.noise.along, one.noise.across], (len(rows), 1, 1)),
                     np.full(len(rows), one.points.in_map),
                 )
             )
-    numbers, objects, times_s, at_m, poses, R, in_map = (
+    numbers, objects, times_s, at_m, poses, noise, in_map = (
         np.concatenate([part[k] for part in parts]) for k in range(7)
     )
     stretches = ((times_s - times_s.min()) // _STRETCH_S).astype(np.int64)
@@ -549,21 +570,9 @@ def _table(sensors: Mapping[str, _Sensor], group: _Group) -> _Table:
         times_s[order],
         at_m[order],
         poses[order],
-        R[order],
+        noise[order],
         in_map[order],
     )
-
-
-def _mean_sights(sights_m: FloatArray) -> FloatArray:
-    """Sights with the mean range of the neighbours: the weight of a detection must not depend on its own error."""
-    ranges_m = np.hypot(*sights_m.T)
-    half = min(4, len(ranges_m) // 2)
-    kernel = np.full(2 * half + 1, 0.5 / half)
-    kernel[half] = 0.0
-    # A reflection without the end itself keeps the slope of the ranges.
-    padded = np.pad(ranges_m, half, mode="reflect", reflect_type="odd")
-    mean_m = np.abs(np.convolve(padded, kernel, mode="valid"))
-    return np.asarray(sights_m * (mean_m / np.maximum(ranges_m, 1e-6))[:, None])
 
 
 _QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -613,11 +622,11 @@ def _rows(
         mine = table.sensors == k
         sight = turned_m[mine] / np.maximum(np.hypot(*turned_m[mine].T), 1e-6)[:, None]
         A[mine, :, column] = np.einsum("nij,nj->ni", full[mine], sight)
-    into_map = rotations(psi + root_turn + yaws)
-    # Sights of detections in the map are already in its axes.
-    into_map[table.in_map] = np.eye(2)
-    R = into_map @ table.R @ into_map.mT
-    return Rows(table.runs, table.times_s, y_m, A, R, still)
+    mounts_m = np.einsum("nij,nj->ni", full, shifts_m) + np.einsum(
+        "nij,nj->ni", turns, root_m
+    )
+    origins_m = table.poses[:, :2] + np.where(table.in_map[:, None], 0.0, mounts_m)
+    return Rows(table.runs, table.times_s, y_m, A, origins_m, table.noise, still)
 
 
 class _Solution(NamedTuple):
@@ -665,7 +674,8 @@ def _solved(
             still = _still(table, fit.velocities_mps)
         H = fit.H.sum(axis=0) + np.diag(prior)
         d = np.zeros(size)
-        d[used] = -psd_solve(H[np.ix_(used, used)], fit.g.sum(axis=0)[used])
+        if used.any():
+            d[used] = -psd_solve(H[np.ix_(used, used)], fit.g.sum(axis=0)[used])
         root = root.shifted(d[:3])
         poses[1:] = [
             pose.shifted(d[3 * k : 3 * k + 3]) for k, pose in enumerate(poses[1:], 1)
@@ -750,6 +760,8 @@ def _spread(
     Errors may be correlated over longer times, or along each object. Then the jackknife
     over those clusters is significantly larger, and counts.
     """
+    from scipy.special import fdtrc
+
     std, dof = _jackknife(system, stretches)
     for clusters in (stretches // 3, objects):
         other, other_dof = _jackknife(system, clusters)
@@ -770,7 +782,7 @@ def _jackknife(system: _System, clusters: IntArray) -> tuple[FloatArray, FloatAr
     """
     H, g, prior, L = system
     names, inverse = np.unique(clusters, return_inverse=True)
-    if len(names) < 2:
+    if len(names) < 2 or not g.shape[1]:
         return np.full(len(L), np.inf), np.zeros(len(L))
     parts = np.zeros((len(names), *H.shape[1:]))
     scores = np.zeros((len(names), H.shape[1]))
@@ -865,7 +877,7 @@ def _group_estimates(
             why = (
                 f"{best.still} objects stand still"
                 if best.still
-                else "the reference: no object that stands still shows its mount"
+                else "no object that stands still shows it"
             )
         elif radial:
             why += ", with an error along the sight"
@@ -887,7 +899,7 @@ def _radial(
     fit = _solved(table, poses, root, _Free(radial=candidates), motion)
     stds = fit.stds[3 * count :]
     dof = fit.dof[3 * count :]
-    factor = stdtrit(np.maximum(dof, _FEWEST_DOF), 1.0 - _SURE)
+    factor = _t_quantile(dof, 1.0 - _SURE)
     limit = np.where(dof >= _FEWEST_DOF, stds, np.inf) * factor
     kept = (np.abs(fit.radial_m) > limit) & (np.abs(fit.radial_m) > _SMALLEST_M)
     return tuple(np.array(candidates)[kept].tolist())
@@ -932,7 +944,7 @@ def _with_root(
 def _is_significant(d: FloatArray, stds: FloatArray, dof: FloatArray) -> BoolArray:
     """Mask of the components of a mount that differ from 0 significantly, and enough to matter."""
     known = np.isfinite(stds) & (dof >= _FEWEST_DOF)
-    factor = stdtrit(np.maximum(dof, _FEWEST_DOF), 1.0 - _SURE)
+    factor = _t_quantile(dof, 1.0 - _SURE)
     limit = np.where(known, stds, np.inf) * factor
     least = np.array([_SMALLEST_RAD, _SMALLEST_M, _SMALLEST_M])
     return np.asarray((np.abs(d) > limit) & (np.abs(d) > least))

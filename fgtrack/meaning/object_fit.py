@@ -6,6 +6,10 @@ innovations of y, and V those of the columns of A, with the same gains. Then the
 parameters minimise sum (v + V d)' S^-1 (v + V d). No path is a parameter, so the paths
 may be any (Anderson and Moore, Optimal Filtering, 1979, chapter 5).
 
+The covariance of a detection has the axes of the predicted sight. With the measured
+sight, the weights would depend on the errors, and ranges would be biased by their
+variance over the range.
+
 All objects are cut into stretches of time. A stretch is filtered by itself, from an
 unknown state. So the stretches are independent, and all are filtered at once.
 """
@@ -42,8 +46,10 @@ class Rows(NamedTuple):
     """Positions in the map, shape (n, 2)."""
     A: FloatArray
     """Derivatives of the positions by the parameters, shape (n, 2, k)."""
-    R: FloatArray
-    """Covariances of the positions, shape (n, 2, 2)."""
+    origins_m: FloatArray
+    """Positions of the sensors in the map, shape (n, 2)."""
+    noise: FloatArray
+    """a and b of the standard deviation sqrt(a^2 + (b range)^2), along and across the sight, shape (n, 2, 2)."""
     still: BoolArray
     """Mask of the detections of objects that stand still, shape (n,)."""
 
@@ -74,7 +80,7 @@ def filtered(rows: Rows) -> Fit:
     X = np.zeros((count, 4, 1 + size))
     P = np.zeros((count, 4, 4))
     X[:, :2] = Y[starts]
-    P[:, :2, :2] = rows.R[starts]
+    P[:, :2, :2] = _covariances(rows, starts, rows.y_m[starts])
     still = rows.still[starts]
     P[:, 2, 2] = P[:, 3, 3] = np.where(still, _STILL_MPS, _UNKNOWN_MPS) ** 2
     density = np.where(still, _STILL_DENSITY, _DENSITY)
@@ -89,15 +95,14 @@ def filtered(rows: Rows) -> Fit:
         p = P[:active]
         _predict(x, p, rows.times_s[at] - rows.times_s[at - 1], density[:active])
         V = Y[at] - x[:, :2]
-        S = p[:, :2, :2] + rows.R[at]
-        W = _inverse(S)
+        R = _covariances(rows, at, x[:, :2, 0])
+        W = _inverse(p[:, :2, :2] + R)
         v = V[:, :, 0]
         nis[at] = np.einsum("ni,nij,nj->n", v, W, v)
         weights = np.minimum(1.0, _HUBER / np.sqrt(np.maximum(nis[at], 1e-12)))
         weights[nis[at] > _OUTLIER_NIS] = _OUTLIER_WEIGHT
         # The smaller weight of an outlier is a larger R, of which the filter learns less too.
-        S = p[:, :2, :2] + rows.R[at] / weights[:, None, None] ** 2
-        W = _inverse(S)
+        W = _inverse(p[:, :2, :2] + R / weights[:, None, None] ** 2)
         WV = W @ V
         H[:active] += V[:, :, 1:].mT @ WV[:, :, 1:]
         g[:active] += np.einsum("nik,ni->nk", V[:, :, 1:], WV[:, :, 0])
@@ -106,6 +111,17 @@ def filtered(rows: Rows) -> Fit:
         p -= K @ p[:, :2]
     back = np.argsort(order, kind="stable")
     return Fit(H[back], g[back], nis, X[back, 2:, 0])
+
+
+def _covariances(rows: Rows, at: IntArray, seen_m: FloatArray) -> FloatArray:
+    """Covariances of the detections `at`, shape (m, 2, 2), of objects at `seen_m` (m, 2)."""
+    sight_m = seen_m - rows.origins_m[at]
+    square_m2 = np.square(sight_m).sum(axis=1)
+    noise = np.square(rows.noise[at])
+    along, across = (noise[:, :, 0] + noise[:, :, 1] * square_m2[:, None]).T
+    outer = sight_m[:, :, None] * sight_m[:, None, :]
+    scale = (along - across) / np.maximum(square_m2, 1e-12)
+    return np.asarray(across[:, None, None] * np.eye(2) + scale[:, None, None] * outer)
 
 
 def _predict(

@@ -1,0 +1,371 @@
+"""Decisions on frames and mounts: from header frames and tf, from the motion of objects, from other sensors."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+
+from fgtrack.core.types import DetectionList, FloatArray
+from fgtrack.inputs.geodetic import GEODETIC
+from fgtrack.inputs.ros.bag import Bag
+from fgtrack.inputs.ros.frames import BagFrames, FrameUse
+from fgtrack.inputs.settings import CsvTable, InputConfig, TopicInput
+from fgtrack.meaning.decision import Decision
+from fgtrack.meaning.frames import FrameTest, frame_of, is_optical
+from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
+from fgtrack.meaning.sample import Sample
+from fgtrack.meaning.tracklets import Points, points_of
+
+__all__ = ["frame_decisions", "mount_decisions"]
+
+#: Messages of a topic whose header frames and heights are read.
+_MESSAGES = 50
+_WORDS = {"map": "the map", "ego": "the ego's frame", "sensor": "the sensor's frame"}
+
+
+def frame_decisions(sample: Sample) -> Iterator[Decision]:
+    """Yield the frame of each sensor, for sensors whose frame the user has not given."""
+    points, motion = points_of(sample.messages, sample.config.ego.detection_origin_m)
+    headers = _HeaderFrames(sample)
+    for name in _sensors(sample):
+        path = sample.input_path(name)
+        if path is None or not sample.is_open((*path, "frame")):
+            continue
+        item = _mapping(sample, name)
+        if item is None or _is_geodetic(item):
+            continue
+        test = None
+        if name in points:
+            test = frame_of(points[name], motion)
+        if isinstance(item, TopicInput):
+            yield from _topic_frame(name, path, headers, points.get(name), test)
+        elif item.frame is None:
+            yield from _table_frame(name, path, points.get(name), test)
+
+
+def _sensors(sample: Sample) -> list[str]:
+    """Names of the sensors with lists, in their order."""
+    names = {item.sensor for item in sample.messages if isinstance(item, DetectionList)}
+    return sorted(names)
+
+
+def _mapping(sample: Sample, name: str) -> TopicInput | CsvTable | None:
+    inputs = sample.config.input
+    return inputs.detections.get(name) or inputs.csv.detections.get(name)
+
+
+def _is_geodetic(item: TopicInput | CsvTable) -> bool:
+    fields = item.fields if isinstance(item, TopicInput) else item.columns
+    return fields is not None and GEODETIC[0] in fields
+
+
+class _HeaderFrames:
+    """Header frames of the topics of a bag; they are read when they are needed."""
+
+    def __init__(self, sample: Sample) -> None:
+        self._sample = sample
+        self._bag: Bag | None = None
+        self._frames: BagFrames | None = None
+
+    def of(
+        self, name: str
+    ) -> tuple[str, FrameUse, tuple[float, float, float] | None] | None:
+        """Return the header frame of a sensor, its use, and its mount by tf; None without a header."""
+        inputs = self._sample.config.input
+        if self._bag is None:
+            self._bag = Bag(self._sample.path, inputs.message_definitions)
+            self._frames = BagFrames(
+                self._bag, inputs.ego.topic if inputs.ego else None
+            )
+        assert self._frames is not None
+        topic = inputs.detections[name].topic
+        for _, _, message in self._bag.messages({topic}):
+            if not hasattr(message, "header"):
+                return None
+            frame = str(message.header.frame_id)
+            return frame, self._frames.use(frame), self._frames.mount(frame)
+        return None
+
+    def heights(self, name: str) -> FloatArray:
+        """Return positions x, y, z of the first messages of a sensor in their own frame, shape (n, 3)."""
+        rows = []
+        config = self._sample.config
+        path = self._sample.input_path(name)
+        if path is not None:
+            item = replace(config.input.detections[name], frame="sensor")
+            config = replace(
+                config,
+                input=InputConfig(
+                    detections={name: item},
+                    message_definitions=config.input.message_definitions,
+                ),
+            )
+            for message in islice(self._sample.read(config), _MESSAGES):
+                if isinstance(message, DetectionList):
+                    rows += [
+                        (each.x_m, each.y_m, each.z_m)
+                        for each in message.objects
+                        if None not in (each.x_m, each.y_m, each.z_m)
+                    ]
+        return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+def _topic_frame(
+    name: str,
+    path: tuple[str, ...],
+    headers: _HeaderFrames,
+    points: Points | None,
+    test: FrameTest | None,
+) -> Iterator[Decision]:
+    """Yield the frame of a topic: by the odometry or tf, else by a test, with its header's name as the first guess."""
+    header = headers.of(name)
+    if header is None:
+        if points is not None and test is not None:
+            yield from _table_frame(name, path, points, test)
+        return
+    frame_id, use, mount = header
+    key = (*path, "frame")
+    if use.evidence == "odometry":
+        reason = f"its frame {frame_id} is {_WORDS[use.frame]} in the ego's odometry"
+        yield Decision(name, "frame", {key: use.frame}, "tested", reason)
+    elif (
+        use.evidence == "tf"
+        and points is not None
+        and points.is_polar
+        and mount is not None
+    ):
+        x_m, y_m, yaw_rad = mount
+        settings = {
+            key: "sensor",
+            ("sensors", name, "mount"): _mount(Pose2(yaw_rad, x_m, y_m)),
+        }
+        yield Decision(
+            name, "mount", settings, "tested", f"tf gives the mount of {frame_id}"
+        )
+    elif use.evidence == "tf":
+        yield Decision(
+            name,
+            "frame",
+            {},
+            "tested",
+            f"tf transforms {frame_id} into {_WORDS[use.frame]}",
+        )
+    elif use.evidence == "name" and (
+        test is None or test.in_map in (None, use.frame == "map")
+    ):
+        reason = f"by the name {frame_id}"
+        sure = test is not None and test.in_map is not None
+        if sure and test is not None:
+            reason = f"{reason}; {test.reason}"
+        yield Decision(
+            name, "frame", {key: use.frame}, "tested" if sure else "assumed", reason
+        )
+    else:
+        yield from _unknown_frame(name, path, frame_id, headers, test)
+
+
+def _unknown_frame(
+    name: str,
+    path: tuple[str, ...],
+    frame_id: str,
+    headers: _HeaderFrames,
+    test: FrameTest | None,
+) -> Iterator[Decision]:
+    """Yield the frame of a topic whose header frame nothing connects to the ego or the map."""
+    key = (*path, "frame")
+    question = f"in which frame is {frame_id}? Set {'.'.join(key)} (map, ego, sensor or optical)"
+    if test is not None and test.is_contradictory:
+        yield Decision(name, "frame", {}, "open", test.reason, question)
+        return
+    if test is not None and test.in_map:
+        yield Decision(name, "frame", {key: "map"}, "tested", test.reason)
+        return
+    optical = is_optical(headers.heights(name))
+    if optical or (optical is None and "optical" in frame_id.lower()):
+        reason = f"{frame_id} is an optical frame: " + (
+            "y is the axis along which objects hardly move"
+            if optical
+            else "by its name"
+        )
+        yield Decision(
+            name, "frame", {key: "optical"}, "tested" if optical else "assumed", reason
+        )
+        return
+    reason = f"nothing connects {frame_id} to the ego or the map"
+    yield Decision(name, "frame", {key: "sensor"}, "assumed", reason)
+
+
+def _table_frame(
+    name: str, path: tuple[str, ...], points: Points | None, test: FrameTest | None
+) -> Iterator[Decision]:
+    """Yield the frame of a table without frames."""
+    key = (*path, "frame")
+    question = (
+        f"in which frame are its positions? Set {'.'.join(key)} (map, ego or sensor)"
+    )
+    if points is None:
+        return
+    if points.is_polar:
+        reason = "ranges and bearings are measured from the sensor"
+        yield Decision(name, "frame", {key: "sensor"}, "assumed", reason)
+    elif test is None:
+        return
+    elif test.is_contradictory:
+        yield Decision(name, "frame", {}, "open", test.reason, question)
+    elif test.in_map is not None:
+        yield Decision(
+            name, "frame", {key: "map" if test.in_map else "ego"}, "tested", test.reason
+        )
+    else:
+        reason = f"positions without a frame; {test.reason}"
+        yield Decision(name, "frame", {key: "ego"}, "assumed", reason)
+
+
+def mount_decisions(sample: Sample) -> Iterator[Decision]:
+    """Yield the mount of each sensor on the ego: as estimated, or assumed where it is not observable.
+
+    A sensor whose header frame is unknown, and whose yaw no test shows, stays open.
+    """
+    paths = {
+        name: path
+        for name in _sensors(sample)
+        if (path := sample.input_path(name)) is not None
+        and sample.is_open(("sensors", name, "mount"))
+    }
+    if not paths:
+        return
+    points, motion = points_of(sample.messages, sample.config.ego.detection_origin_m)
+    assumed = _assumed_mounts(sample, points)
+    known = _known_frames(sample, points)
+    mounts = estimated_mounts(points, motion, assumed, known)
+    for name, path in paths.items():
+        if name not in points:
+            if _has_unknown_header(sample, name):
+                yield _unanswered(name, "it has no positions that the tests can use")
+        elif not points[name].in_map:
+            yield from _mount_decision(sample, mounts, name, path, known)
+
+
+def _unanswered(name: str, why: str) -> Decision:
+    """Open decision on the mount of a sensor in an unknown frame."""
+    return Decision(name, "mount", {}, "open", why, _question(name))
+
+
+def _question(name: str) -> str:
+    return f"where is it mounted? Set sensors.{name}.mount (x_m, y_m, yaw_rad)"
+
+
+def _assumed_mounts(sample: Sample, points: Mapping[str, Points]) -> dict[str, Pose2]:
+    """Return the configured mounts of sensors whose detections are in their own frame."""
+    frames = {
+        item.sensor: item.frame
+        for item in sample.messages
+        if isinstance(item, DetectionList)
+    }
+    result = {}
+    for name in points:
+        sensor = sample.config.sensors.get(name)
+        if sensor is not None and sensor.mount is not None and frames[name] == "sensor":
+            mount = sensor.mount
+            result[name] = Pose2(mount.yaw_rad, mount.x_m, mount.y_m)
+    return result
+
+
+def _known_frames(sample: Sample, points: Mapping[str, Points]) -> list[str]:
+    """Return the sensors with a known frame or mount, then those with positions in the ego frame by assumption."""
+    frames = {
+        item.sensor: item.frame
+        for item in sample.messages
+        if isinstance(item, DetectionList)
+    }
+    known = []
+    for name in points:
+        sensor = sample.config.sensors.get(name)
+        is_given = sensor is not None and sensor.mount is not None
+        if frames[name] == "map" or (frames[name] == "sensor" and is_given):
+            known.append(name)
+    size = {name: len(points[name].points_m) for name in points}
+    in_ego = [
+        name for name in points if frames[name] == "ego" and not points[name].is_polar
+    ]
+    return [*known, *sorted(in_ego, key=lambda name: (-size[name], name))]
+
+
+def _mount_decision(
+    sample: Sample,
+    mounts: Mounts,
+    name: str,
+    path: tuple[str, ...],
+    known: Sequence[str],
+) -> Iterator[Decision]:
+    """Yield the decision on the mount of one sensor."""
+    item = mounts[name]
+    reference = mounts.references.get(name, name)
+    is_placed = reference in known or mounts[reference].is_sure_of_yaw
+    against = "" if reference == name else f"against {reference}: "
+    if _is_read_in_ego(sample, name):
+        # The recording itself puts the sensor into the ego, so nothing is changed.
+        if item.is_off and reference in known and reference != name:
+            reason = (
+                f"its header puts it into the ego's frame, but {against}{item.words}"
+            )
+            yield Decision(name, "mount", {}, "assumed", reason, _question(name))
+        return
+    if item.is_off and is_placed:
+        frame = "optical" if _mapping_frame(sample, name) == "optical" else "sensor"
+        settings = {
+            ("sensors", name, "mount"): _mount(item.significant_pose),
+            (*path, "frame"): frame,
+        }
+        question = (
+            None
+            if item.is_known
+            else f"components without an interval are assumed; {_question(name)}"
+        )
+        yield Decision(
+            name, "mount", settings, "tested", f"{against}{item.words}", question
+        )
+    elif item.is_sure_of_yaw and is_placed:
+        reason = f"no mount is significant, {against}{item.words}"
+        question = (
+            None
+            if item.is_known
+            else f"its lever arm is assumed to be 0; {_question(name)}"
+        )
+        yield Decision(name, "mount", {}, "tested", reason, question)
+    elif _has_unknown_header(sample, name):
+        yield _unanswered(name, f"its frame is unknown: {item.why}")
+    else:
+        reason = f"at the origin of the ego, its axis ahead: {item.why}"
+        yield Decision(name, "mount", {}, "assumed", reason, _question(name))
+
+
+def _is_read_in_ego(sample: Sample, name: str) -> bool:
+    """True if the header of a topic names the ego, or tf transforms it into the ego."""
+    item = _mapping(sample, name)
+    return isinstance(item, TopicInput) and item.frame in (None, "ego")
+
+
+def _mapping_frame(sample: Sample, name: str) -> str | None:
+    item = _mapping(sample, name)
+    return None if item is None else item.frame
+
+
+def _has_unknown_header(sample: Sample, name: str) -> bool:
+    """True if a topic is read in the frame of a sensor, because its header names an unknown frame."""
+    item = _mapping(sample, name)
+    path = sample.input_path(name)
+    is_open = path is not None and sample.is_open((*path, "frame"))
+    return (
+        is_open and isinstance(item, TopicInput) and item.frame in ("sensor", "optical")
+    )
+
+
+def _mount(pose: Pose2) -> dict[str, float]:
+    """Plain values of a mount, rounded."""
+    return {
+        "x_m": round(pose.x_m, 2),
+        "y_m": round(pose.y_m, 2),
+        "yaw_rad": round(pose.yaw_rad, 4),
+    }
