@@ -5,16 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.interpolate import BSpline
 
-from fgtrack.core.types import (
-    Detection,
-    DetectionList,
-    EgoState,
-    FloatArray,
-    IntArray,
-    Message,
-)
+from fgtrack import Detection, DetectionList, EgoState, Message
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 DURATION_S = 60.0
 STEP_S = 0.005

@@ -27,6 +27,7 @@ __all__ = ["MountEstimate", "Mounts", "Pose2", "estimated_mounts"]
 
 #: Search: step of the yaw, size of the cells of offsets, largest lever arm between two sensors, and most samples.
 _STEP_RAD = math.radians(2.0)
+_YAWS_RAD = np.arange(-math.pi, math.pi, _STEP_RAD)
 _CELL_M = 1.0
 _REACH_M = 12.0
 _USUAL_ARM_M = 5.0
@@ -34,6 +35,9 @@ _MOST_SAMPLES = 2000
 #: Fewest common detections of two sensors, and smallest share of the detections that could be common.
 _FEWEST_COMMON = 60
 _LEAST_COMMON = 0.3
+#: Yaws that differ by more are other yaws; their support must be smaller by this factor.
+_OTHER_RAD = 0.3
+_UNIQUE = 1.3
 #: Gates of two tracklets of one object, in standard deviations, and the usual error of the alignment before each.
 _GATES = ((4.0, 1.0, 0.03), (4.0, 0.4, 0.01), (4.0, 0.2, 0.005))
 _GAP_S = 1.0
@@ -298,6 +302,8 @@ class _Alignment(NamedTuple):
     pose: Pose2
     support: float
     """Number of common detections, less for long lever arms."""
+    runner_up: float = 0.0
+    """Largest support of another yaw."""
 
 
 def _aligned(common: _Common) -> _Alignment:
@@ -307,7 +313,8 @@ def _aligned(common: _Common) -> _Alignment:
     arms_m2 = np.square(centres_m)[:, None] + np.square(centres_m)
     prior = np.exp(-0.5 * arms_m2 / _USUAL_ARM_M**2)
     best = _Alignment(Pose2(), 0.0)
-    for yaw_rad in np.arange(-math.pi, math.pi, _STEP_RAD).tolist():
+    supports = list[float]()
+    for yaw_rad in _YAWS_RAD.tolist():
         cells = (
             common.first_m - common.second_m @ rotation(yaw_rad).T + _REACH_M
         ) // _CELL_M
@@ -324,10 +331,13 @@ def _aligned(common: _Common) -> _Alignment:
         )
         support = near * prior
         row, column = np.unravel_index(int(np.argmax(support)), support.shape)
+        supports.append(float(support[row, column]))
         if support[row, column] > best.support:
             pose = Pose2(yaw_rad, float(centres_m[row]), float(centres_m[column]))
             best = _Alignment(pose, float(support[row, column]))
-    return best
+    yaws_rad = _YAWS_RAD - best.pose.yaw_rad
+    others = np.array(supports)[np.cos(yaws_rad) < math.cos(_OTHER_RAD)]
+    return best._replace(runner_up=float(others.max()))
 
 
 def _matched(
@@ -430,11 +440,15 @@ def _groups(sensors: Mapping[str, _Sensor], preferred: Sequence[str]) -> list[_G
         if sensors[first].points.in_map and sensors[second].points.in_map:
             links.append((float(_FEWEST_COMMON), first, second, Pose2()))
             continue
-        pose, pairs = _refined(common, _aligned(common).pose)
+        start = _aligned(common)
+        pose, pairs = _refined(common, start.pose)
         count = sum(pairs.values())
-        # Times at which both sensors detect at least one object.
-        possible = len(np.unique(common.second_m, axis=0))
-        if count >= max(_FEWEST_COMMON, _LEAST_COMMON * possible):
+        # The sensor that detects less limits the number of common detections.
+        possible = min(
+            len(np.unique(each, axis=0)) for each in (common.first_m, common.second_m)
+        )
+        is_unique = start.support >= _UNIQUE * start.runner_up
+        if is_unique and count >= max(_FEWEST_COMMON, _LEAST_COMMON * possible):
             links.append((float(count), first, second, pose))
     groups: list[_Group] = []
     rest = sorted(
@@ -614,7 +628,7 @@ def _rows(
             "nij,nj->ni", full[mine], turned_m[mine] @ _QUARTER.T
         )
         A[mine, :, 3 * k + 1 : 3 * k + 3] = full[mine]
-    # Objects that move say little about the ego's motion, and turn with it on a bend.
+    # Moving objects are left out: on a bend they turn with the ego.
     body = still & ~table.in_map
     A[body, :, 0] = np.einsum("nij,nj->ni", full[body], u_m[body] @ _QUARTER.T)
     A[body, :, 1:3] = turns[body]
@@ -736,8 +750,7 @@ def _turn_of_still(
     turn = np.arctan2(*-ego_mps[usable].T[::-1]) - np.arctan2(
         *relative_mps[usable].T[::-1]
     )
-    angles = np.arange(-math.pi, math.pi, _STEP_RAD)
-    near = np.cos(turn[:, None] - angles) > math.cos(2.0 * _STEP_RAD)
+    near = np.cos(turn[:, None] - _YAWS_RAD) > math.cos(2.0 * _STEP_RAD)
     votes = near.sum(axis=0)
     zero = int((np.cos(turn) > math.cos(2.0 * _STEP_RAD)).sum())
     if 2 * zero >= votes.max():
