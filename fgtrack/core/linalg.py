@@ -1,4 +1,4 @@
-"""Small dense linear algebra for single symmetric matrices and stacks of them."""
+"""Linear algebra of small symmetric matrices, single or stacked."""
 
 from collections.abc import Hashable, Sequence
 from functools import cache
@@ -13,7 +13,7 @@ from fgtrack.core.types import FloatArray, IntArray
 
 @cache
 def kernels(name: str) -> ModuleType:
-    """Return the module `name` of compiled loops; it is imported at its first use, because numba loads slowly."""
+    """Return the module `name` of compiled loops. It is imported at its first use, because numba loads slowly."""
     return import_module(name)
 
 
@@ -34,7 +34,7 @@ def identity(n: int) -> FloatArray:
 def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
     """Group equal `items`: for each distinct item its ascending indices, in the order of first occurrence.
 
-    The items of a group are processed as one stack of matrices.
+    The caller processes the items of a group as one stack of matrices.
     """
     groups: dict[Hashable, list[int]] = {}
     for index, item in enumerate(items):

@@ -29,8 +29,7 @@ class Alias:
 class Registry:
     """Parts of one kind by name: built-in parts and plug-ins (entry points), loaded at their first use.
 
-    A plug-in is left out with a warning if its name belongs to a built-in part or to an
-    earlier plug-in.
+    A plug-in whose name belongs to a built-in part or to an earlier plug-in is ignored with a warning.
     """
 
     def __init__(

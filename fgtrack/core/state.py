@@ -55,7 +55,7 @@ def put_back(owner: object, names: Iterable[str], snapshot: Snapshot) -> None:
 
 
 def stateful(item: object) -> Stateful:
-    """Return `item`. Raises `CallError` for an object of a class without a state, such as that of a plug-in."""
+    """Return `item`. Raises `CallError` for an object of a class without a state, for example of a plug-in."""
     if not isinstance(item, Stateful):
         raise CallError(
             f"{type(item).__name__} has no checkpoint: derive the class from fgtrack.Stateful, and name the "
@@ -65,7 +65,7 @@ def stateful(item: object) -> Stateful:
 
 
 def copied(value: _T) -> _T:
-    """Return a copy of a value that may change, and a value that never changes itself.
+    """Return a copy of a value that may change. A value that never changes is returned itself.
 
     A `Stateful` object gives its checkpoint.
     """
@@ -74,7 +74,7 @@ def copied(value: _T) -> _T:
 
 
 def _new_copier(kind: type) -> Callable[[Any], Any] | None:
-    """Return the function that copies objects of a type; None where they never change."""
+    """Return the function that copies objects of the type `kind`; None if these objects never change."""
     if issubclass(kind, Stateful):
         return kind.checkpoint
     if issubclass(kind, np.ndarray):
@@ -94,7 +94,7 @@ _copier: Callable[[type], Callable[[Any], Any] | None] = cache(_new_copier)
 
 
 def _are_fixed(values: Collection[Any]) -> bool:
-    """True if none of the values can change; of tuples, none of their items."""
+    """True if none of the values can change. A tuple cannot change if none of its items can."""
     kinds = set(map(type, values))
     if tuple in kinds:
         kinds.remove(tuple)
@@ -186,4 +186,6 @@ class _Reader(pickle.Unpickler):
             found = getattr(import_module(module), name)
             if isinstance(found, type):
                 return found
-        raise DataError(f"the checkpoint contains {module}.{name}, which is no state")
+        raise DataError(
+            f"the checkpoint contains {module}.{name}, which is not a state: load a file of `save`"
+        )

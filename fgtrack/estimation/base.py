@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 Content = tuple[tuple[int, ...], tuple[float, ...], tuple[str, ...]]
-"""Number of components and their codes; z, R, pose, kind and width of the loss; assumed components. It has an order."""
+"""Sort key of a measurement: number of components and their codes; z, R, pose, kind and width of the loss; assumed
+components.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +50,16 @@ class Measurement:
     stamp_ns: int
     model: MeasurementModel
     z: FloatArray
-    """Measured components, shape (k,); (m, k) of a stack."""
+    """Measured components, shape (k,); in a stack of m measurements (m, k)."""
     R: FloatArray
-    """Covariance, shape (k, k); (m, k, k) of a stack."""
+    """Covariance, shape (k, k); in a stack of m measurements (m, k, k)."""
     pose: SensorPose = AT_ORIGIN
     loss: RobustLoss | None = None
-    """Robust loss; None is the Gaussian."""
+    """Robust loss; None for the square (Gaussian errors)."""
     assumed: tuple[str, ...] = ()
-    """Components that are prior knowledge, as a heading from the map: fused like the others, but not measured."""
+    """Components that are prior knowledge, such as a heading from the map. They are fused, but do not count for the
+    NIS.
+    """
 
     def __post_init__(self) -> None:
         if (
@@ -78,10 +82,13 @@ class Measurement:
         assumed: tuple[str, ...] = (),
         **values: float,
     ) -> "Measurement":
-        """The measurement of `values`, by name of `COMPONENTS`, with a standard deviation each or a covariance.
-        `std` is a mapping by the same names, or one number for values of one unit (x and y).
-        `covariance`, shape (k, k), is in the order of `COMPONENTS`. Raises `CallError` for an unknown or missing name
-        and a value or covariance that makes no sense.
+        """Return the measurement of `values`, keyed by the names of `COMPONENTS`.
+
+        Give the errors either as `std` or as `covariance`. `std` is a mapping from the same names to standard
+        deviations, or one number if all values have the same unit (x and y). `covariance`, shape (k, k), is in
+        the order of `COMPONENTS`.
+
+        Raises `CallError` for an unknown or missing name, and for an invalid value or covariance.
         """
         names = tuple(name for name in COMPONENTS if name in values)
         if not names or len(names) < len(values):
@@ -112,7 +119,7 @@ class Measurement:
             std = dict.fromkeys(names, std)
         if std is not None and std.keys() != values.keys():
             raise CallError(
-                f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}"
+                f"measurement of {', '.join(names)}: std must name these components, names {', '.join(std)}"
             )
         stamp_ns = as_stamp("measurement: stamp_ns", stamp_ns)
         for name, value in (*values.items(), *(std or {}).items()):
@@ -144,7 +151,9 @@ class Measurement:
         )
 
     def seen_by(self, motion: MotionModel) -> "Measurement":
-        """This measurement with the model for the state of `motion`: itself where that is its model already."""
+        """Return this measurement with the measurement model for the state of `motion`; itself if it has this
+        model already.
+        """
         names = self.model.state_names
         if names is motion.state_names or names[:4] == motion.state_names[:4]:
             return self
@@ -152,12 +161,15 @@ class Measurement:
 
     @property
     def is_nonlinear(self) -> bool:
-        """True if it has to be linearised, or weighted, at a state."""
+        """True if the measurement must be linearised, or weighted by a robust loss, at a state."""
         return self.loss is not None or not self.model.linear
 
     @property
     def content(self) -> Content:
-        """All but the stamp: only what is the same in every respect is equal. Compiled loops compare in this order."""
+        """Return all values but the stamp, as a sort key. Only identical measurements have equal content.
+
+        Compiled loops compare measurements in the same order.
+        """
         k, codes = len(self.z), self.model.codes.tolist()
         kind, width = compiled_form(self.loss, k)
         numbers = self.z.tolist(), self.R.ravel().tolist(), self.pose, (kind, width)
@@ -165,7 +177,7 @@ class Measurement:
 
     @property
     def order(self) -> tuple[int, Content]:
-        """Order among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
+        """Return the sort key by stamp, and at equal stamps by content. So the order of arrival does not matter."""
         return self.stamp_ns, self.content
 
     @property
@@ -174,7 +186,9 @@ class Measurement:
         return _measured(self.model.components, self.assumed)
 
     def nis(self, innovation: FloatArray, S: FloatArray) -> float:
-        """Normalised innovation squared y' S^-1 y of y (k,) and S (k, k), without components that are `assumed`."""
+        """Return the normalised innovation squared y' S^-1 y of y (k,) and S (k, k), without the components
+        that are `assumed`.
+        """
         return float(mahalanobis_squared(innovation, S, self.measured))
 
 
@@ -187,11 +201,11 @@ def _measured(components: tuple[str, ...], assumed: tuple[str, ...]) -> IntArray
 
 
 class Lazy(Sequence[_T], Generic[_T]):
-    """A sequence that makes each item when the item is read."""
+    """A sequence that makes each item at every access to the item."""
 
     @abstractmethod
     def item(self, index: int) -> _T:
-        """Return the item at an index from 0 to the length."""
+        """Return the item at an index from 0 to the length of the sequence minus 1."""
 
     @overload
     def __getitem__(self, index: int) -> _T: ...
@@ -206,11 +220,11 @@ class Lazy(Sequence[_T], Generic[_T]):
 
 
 class Measurements(Lazy[Measurement]):
-    """Measurements of several objects that differ in their numbers alone."""
+    """Measurements of several objects by one sensor at one stamp. They differ in z and R only."""
 
     def __init__(self, stack: Measurement) -> None:
         self.stack = stack
-        """All of them: z (m, k) and R (m, k, k)."""
+        """All measurements as one stack: z (m, k) and R (m, k, k)."""
 
     def __len__(self) -> int:
         return len(self.stack.z)
@@ -232,7 +246,7 @@ class Measurements(Lazy[Measurement]):
 def stacks(
     measurements: Sequence[Measurement],
 ) -> list[tuple[Sequence[int], Measurement]]:
-    """Return the measurements that differ in their numbers alone: their indices, and the stack of them."""
+    """Group measurements that differ in z and R only. Return the indices and the stack of each group."""
     if isinstance(measurements, Measurements):
         return [(range(len(measurements.stack.z)), measurements.stack)]
     parts = list[tuple[Sequence[int], Measurement]]()
@@ -267,14 +281,14 @@ class UpdateResult:
 
     status: UpdateStatus
     innovation: FloatArray | None = None
-    """Measured (or assumed) minus predicted at the measurement's own stamp, shape (k,)."""
+    """Measured minus predicted value at the stamp of the measurement, shape (k,)."""
     nis: float | None = None
-    """Normalised innovation squared against the prior at that stamp, `Measurement.nis`."""
+    """Normalised innovation squared, see `Measurement.nis`."""
     innovation_covariance: FloatArray | None = None
-    """Covariance S of the innovation, shape (k, k), of estimators that report it."""
+    """Covariance S of the innovation, shape (k, k); None if the estimator does not report S."""
 
 
-#: Standard deviation of a direction of which nothing is known: that of the uniform distribution.
+#: Standard deviation of an unknown direction: the uniform distribution has this standard deviation.
 UNKNOWN_YAW_STD_RAD = math.pi / math.sqrt(3.0)
 KNOWN_YAW_STD_RAD = 0.1
 
@@ -286,20 +300,21 @@ class Start:
     stamp_ns: int = 0
     position_m: Sequence[float] | FloatArray = (0.0, 0.0)
     position_std_m: float = 1.0
-    """Along both axes; not used where `position_covariance` is given."""
+    """Standard deviation along both axes; not used if `position_covariance` is given."""
     position_covariance: FloatArray | None = None
     """Shape (2, 2)."""
     position_cross: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Covariance of the position with further entries of the state, by their names: where it is off by an error that
-    lasts, this entry is known to be opposite. `yaw_rad` and `speed_mps` may be named for every motion model."""
+    """Covariance of the position with other entries of the state, by their names, for example with a
+    time-correlated sensor error. `yaw_rad` and `speed_mps` may be named for every motion model.
+    """
     yaw_cross: Mapping[str, float] = field(default_factory=dict)
-    """Covariance of the yaw with `speed_mps`, and with entries of the state behind the speed, by their names."""
+    """Covariance of the yaw with `speed_mps`, and with entries of the state after the speed, by their names."""
     speed_cross: Mapping[str, float] = field(default_factory=dict)
-    """Covariance of the speed with entries of the state behind the speed, by their names."""
+    """Covariance of the speed with entries of the state after the speed, by their names."""
     yaw_rad: float | None = None
-    """Direction of travel; None where it is unknown."""
+    """Direction of travel; None if it is unknown."""
     yaw_std_rad: float | None = None
-    """None for `KNOWN_YAW_STD_RAD`, or `UNKNOWN_YAW_STD_RAD` where `yaw_rad` is None."""
+    """None stands for `KNOWN_YAW_STD_RAD`, or for `UNKNOWN_YAW_STD_RAD` if `yaw_rad` is None."""
     speed_mps: float = 0.0
     speed_std_mps: float = 10.0
     yaw_rate_radps: float = 0.0
@@ -322,7 +337,7 @@ class Start:
 
 
 _MOST = LARGEST**4
-"""No number of a start is larger: products of what is measured and configured are not, and its square is finite."""
+"""Largest number of a start. Products of measured and configured values are smaller, and the square is finite."""
 _SHAPES = {"position_m": (2,), "position_covariance": (2, 2)}
 
 
@@ -332,7 +347,7 @@ def _check(name: str, value: object, rule: str, holds: bool) -> None:
 
 
 def _is_array(value: object, shape: tuple[int, ...], least: float) -> bool:
-    """True if it has this shape, and numbers from `least` to `_MOST`."""
+    """True if `value` has this shape, and numbers from `least` to `_MOST`."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of several lengths
@@ -346,23 +361,23 @@ def _is_array(value: object, shape: tuple[int, ...], least: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class StatesAt:
-    """States of those tracks that existed at one stamp, in order of birth."""
+    """States of the tracks that existed at a stamp, in order of birth."""
 
     track_ids: tuple[int, ...]
     means: FloatArray
-    """Shape (m, n), in the motion model's own state."""
+    """Shape (m, n), in the state of the motion model."""
     covariances: FloatArray
     """Shape (m, n, n)."""
 
     def of(self, track_id: int) -> "StatesAt":
-        """Return the state of one track; of no track where it has none."""
+        """Return the state of one track; an empty `StatesAt` if the track has no state."""
         rows = [row for row, each in enumerate(self.track_ids) if each == track_id]
         return StatesAt(
             (track_id,) * len(rows), self.means[rows], self.covariances[rows]
         )
 
     def without(self, track_ids: Collection[int]) -> "StatesAt":
-        """Return the states of all tracks but these; itself where no state is left out."""
+        """Return the states of all tracks except `track_ids`; this object itself if it has none of them."""
         rows = [row for row, each in enumerate(self.track_ids) if each not in track_ids]
         if len(rows) == len(self.track_ids):
             return self
@@ -375,7 +390,11 @@ class StatesAt:
 
 @runtime_checkable
 class TrackBank(Protocol):
-    """The estimators of all objects: states at a stamp for association, then the measurements of that stamp."""
+    """The estimators of all objects.
+
+    The tracker asks for the states at the stamp of a list, associates the detections, and fuses the measurements of
+    this stamp.
+    """
 
     @property
     def present_ns(self) -> int:
@@ -387,13 +406,13 @@ class TrackBank(Protocol):
 
     @property
     def track_ids(self) -> tuple[int, ...]:
-        """All tracks in order of birth."""
+        """Ids of all tracks, in order of birth."""
 
     def advance(self, now_ns: int) -> None:
-        """The clock moved: bring every track to the present."""
+        """Predict all tracks to the new present `now_ns`."""
 
     def states_at(self, stamp_ns: int) -> StatesAt:
-        """States at `stamp_ns`, in the past or the present."""
+        """Return the states at `stamp_ns`, in the past or the present."""
 
     def update(
         self,
@@ -401,20 +420,25 @@ class TrackBank(Protocol):
         track_ids: Sequence[int],
         measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
-        """Fuse one measurement for each of `track_ids`, all of the same stamp."""
+        """Fuse one measurement for each of `track_ids`, all with the same stamp. Return the results in this order."""
 
     def birth(self, track_id: int, prior: Start) -> None:
-        """Start a track at the prior's stamp."""
+        """Start a track at the stamp of the `prior`."""
 
     def remove(self, track_id: int) -> None:
         """Forget a track."""
 
     def present(self) -> Sequence[TrackState]:
-        """Kinematic states (x, y, yaw, speed, yaw rate[, acceleration]) now, in the order of `track_ids`."""
+        """Return the kinematic states at the present, in the order of `track_ids`.
+
+        A kinematic state is x, y, yaw, speed, yaw rate and, if the model has it, acceleration.
+        """
 
     def smoothed(self) -> list[SmoothedReport]:
-        """Kinematic states of the past, improved by later measurements; of a filter none.
-        Lagged ones as they are now, final ones that left a window, or whose track was removed, since the last call.
+        """Return kinematic states of the past that later measurements have improved; a filter returns none.
+
+        A lagged state is reported as it is now. A final state is reported once: when it has left its window, or
+        when its track was removed.
         """
 
 
@@ -428,40 +452,42 @@ class MeasurementBank(TrackBank, Protocol):
 
 @runtime_checkable
 class WindowBank(MeasurementBank, Protocol):
-    """A bank that gives out its windows: the smoothers."""
+    """A bank that can return copies of its windows: a smoother."""
 
     def window(self, track_id: int) -> "Window":
         """Return a copy of the window of a track."""
 
     def withdraw(self, track_id: int, measurement: Measurement) -> bool:
-        """Take a measurement back, as if it had never been fused. Return False if it is not kept."""
+        """Undo the fusion of a measurement. Return False if the measurement is not in the window."""
 
 
 def no_states(dim: int) -> StatesAt:
-    """The states of no track at all."""
+    """Return the empty `StatesAt`: states (0, n) of dimension `dim`."""
     return StatesAt((), np.empty((0, dim)), np.empty((0, dim, dim)))
 
 
 @runtime_checkable
 class Estimator(Protocol):
-    """One object: fuses measurements in any order of arrival."""
+    """Estimator of one object, which fuses measurements in any order of arrival."""
 
     @property
     def window_ns(self) -> tuple[int, int]:
-        """Oldest stamp that can still be fused or asked for, and the newest stamp fused."""
+        """Oldest stamp that can be fused or asked for, and newest fused stamp."""
 
     def update(self, measurement: Measurement) -> UpdateResult:
-        """Fuse `measurement` at its own stamp; one that is older than the window changes nothing."""
+        """Fuse `measurement` at its own stamp. A measurement that is older than the window changes nothing."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
-        """State, in the motion model's own form, at any stamp in or after the window."""
+        """Return the state at any stamp in or after the window, in the state of the motion model."""
 
     def advance(self, now_ns: int) -> None:
-        """The clock moved: move the window, nothing else."""
+        """Move the window to the clock `now_ns`. The estimate does not change."""
 
 
 def asked_stamp(stamp_ns: object, oldest_ns: int) -> int:
-    """Return a stamp for which a state is asked. Raises `CallError` for an invalid one and before `oldest_ns`."""
+    """Return a requested stamp as an integer. Raises `CallError` for an invalid stamp, and for a stamp before
+    `oldest_ns`.
+    """
     stamp = as_stamp("stamp_ns", stamp_ns)
     if stamp < oldest_ns:
         raise CallError(
@@ -471,6 +497,6 @@ def asked_stamp(stamp_ns: object, oldest_ns: int) -> int:
 
 
 def described(name: str, motion: MotionModel, window_ns: tuple[int, int]) -> str:
-    """Return a line on the estimator `name` of one object: motion model and window, for its repr."""
+    """Return the text of `repr` for the estimator `name` of one object: its motion model and its window."""
     oldest_ns, newest_ns = window_ns
     return f"<{name} of one object: {type(motion).__name__}, window {oldest_ns} to {newest_ns} ns>"

@@ -11,10 +11,10 @@ from fgtrack.models.motion import MotionModel
 
 
 def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n), in the state of `motion`, of `start`.
+    """Return mean (n,) and covariance (n, n) of a `start`, in the state of `motion`.
 
-    Without a direction of travel, a Cartesian velocity is isotropic with mean zero, a yaw 0 with a wide standard
-    deviation. Raises `CallError` where a cross-covariance names an entry that the state lacks.
+    Without a direction of travel, a Cartesian velocity is isotropic with mean 0, and a yaw is 0 with a wide
+    standard deviation. Raises `CallError` if a cross-covariance names an entry that the state lacks.
     """
     position = np.eye(2) * start.position_std_m**2
     if start.position_covariance is not None:
@@ -63,9 +63,10 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
 
 
 def _crosses(start: Start) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the cross-covariances of position, yaw and speed: with each other, and with further entries by name.
+    """Return the cross-covariances of position, yaw and speed: with each other, and with other entries by name.
 
-    The first are an upper triangle of x, y, yaw and speed, shape (4, 4). The others have a column (4,) for each name.
+    The first result is an upper triangle of x, y, yaw and speed, shape (4, 4). The second result has a column (4,)
+    for each name.
     """
     kinematic, further = np.zeros((4, 4)), dict[str, FloatArray]()
     given = (

@@ -13,28 +13,28 @@ __all__ = ["EstimatorError", "Failure", "Failures"]
 
 
 class Failure(StrEnum):
-    """A kind of failure, or of what was done about one."""
+    """Kind of a failure inside an estimator, or of the tracker's response."""
 
     NOT_FINITE = "not finite"
-    """A state that was to be published was not, or was beyond any vehicle on Earth, see `faults`."""
+    """A state that was to be published was not finite, or was beyond any vehicle on Earth, see `faults`."""
     NOT_DEFINITE = "not positive definite"
-    """A covariance that was to be published was not."""
+    """A covariance that was to be published was not positive definite."""
     UPDATE_FAILED = "update failed"
     """A measurement could not be fused; its disposition is `failed`."""
     ESTIMATOR_RAISED = "estimator raised"
-    """An estimator raised an exception when it was asked for states, or given the clock."""
+    """An estimator raised an exception when the tracker asked for its states or advanced its clock."""
     GRAPH_REBUILT = "graph rebuilt"
     """A factor graph could not be solved with a new measurement, and was rebuilt without it."""
     STEP_DAMPED = "step damped"
-    """A smoother's step went too far and was repeated with a line search."""
+    """A step of a smoother overshot, and was repeated with a line search."""
     BIRTH_FAILED = "birth failed"
     """A detection could not start a track; its disposition is `failed`."""
     LIST_FAILED = "list failed"
     """The processing of an object list, or of a part, raised an exception; its remaining detections are `failed`."""
     STEP_FAILED = "step failed"
-    """A step beside the estimate, as the count of the life of a track, raised an exception and was left out."""
+    """A step that does not change estimates, such as the lifecycle of a track, raised an exception and was skipped."""
     TRACK_ENDED = "track ended"
-    """A track that failed ended."""
+    """A track ended because of a failure."""
 
 
 class EstimatorError(Exception):
@@ -50,16 +50,18 @@ class EstimatorError(Exception):
             f"estimators of the tracks {', '.join(map(str, causes))} raised"
         )
         self.causes = causes
-        """What was raised, by track."""
+        """Exceptions by track id."""
         self.answers = answers
-        """Results of the other tracks."""
+        """Results of the other tracks, by track id."""
         self.unchanged = frozenset(unchanged)
-        """Those of the `causes` whose states are as they were before the call; the states of the rest are unknown."""
+        """Tracks among `causes` whose states are as before the call. The states of the other failed tracks are
+        unknown.
+        """
 
 
 @dataclass
 class Failures(Stateful):
-    """Counts by kind, shared by all that may fail in one tracker."""
+    """Counts of failures by kind. All parts of one tracker share this object."""
 
     STATE: ClassVar[tuple[str, ...]] = (
         "counts",
@@ -70,18 +72,18 @@ class Failures(Stateful):
 
     counts: Counter[Failure] = field(default_factory=Counter)
     ended: list[dict[str, int | str]] = field(default_factory=list)
-    """Tracks that failures have ended, the first hundred, as in meta.json."""
+    """The first hundred tracks that failures have ended, as in meta.json."""
     first: str | None = None
-    """Message of the first failure, in a line."""
+    """Message of the first failure, on one line."""
     last: str | None = None
-    """Traceback, or line, of the newest one."""
+    """Traceback or message of the newest failure."""
 
     def add(self, failure: Failure, count: int = 1) -> None:
         """Count a failure."""
         self.counts[failure] += count
 
     def end(self, track_id: int, now_ns: int, failure: Failure) -> None:
-        """Count a track that ends."""
+        """Count a track that a failure has ended."""
         self.add(Failure.TRACK_ENDED)
         if len(self.ended) < 100:
             self.ended.append(
@@ -89,7 +91,7 @@ class Failures(Stateful):
             )
 
     def note(self, what: str | BaseException) -> None:
-        """Remember the message of a failure, or its exception."""
+        """Keep a message or an exception as the newest failure, and as the first failure if there was none before."""
         if isinstance(what, BaseException):
             name = (
                 "not enough memory"
@@ -102,7 +104,7 @@ class Failures(Stateful):
         self.first = self.first or " ".join(line.split())
 
     def as_meta(self) -> dict[str, object]:
-        """Counts as in meta.json: every kind, zeros included."""
+        """Return the counts of all kinds, zeros included, as in meta.json."""
         return {
             "failures": {failure.value: self.counts[failure] for failure in Failure},
             "first_failure": self.first,

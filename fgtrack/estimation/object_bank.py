@@ -38,7 +38,9 @@ _T = TypeVar("_T")
 
 
 class Outcomes:
-    """Outcomes of an update of several tracks, part by part: what one part raises does not concern the others."""
+    """Results of an update of several tracks, collected part by part. An exception of one part does not affect
+    other parts.
+    """
 
     def __init__(self) -> None:
         self._answers = dict[int, UpdateResult]()
@@ -48,7 +50,7 @@ class Outcomes:
     def add(
         self, track_ids: Sequence[int], fuse: Callable[[], Sequence[UpdateResult]]
     ) -> None:
-        """Note what `fuse` returns for these tracks, or what it raises; but a `DataError` propagates."""
+        """Add the results that `fuse` returns for these tracks, or its exception. A `DataError` propagates."""
         try:
             self._answers.update(zip(track_ids, fuse(), strict=True))
         except DataError:
@@ -61,7 +63,7 @@ class Outcomes:
             self._causes.update(dict.fromkeys(track_ids, error))
 
     def results(self, track_ids: Sequence[int]) -> list[UpdateResult]:
-        """Return the results of all tracks. Raises `EstimatorError` if some raised."""
+        """Return the results of all tracks. Raises `EstimatorError` if a part has raised."""
         if self._causes:
             raise EstimatorError(self._causes, self._answers, self._unchanged)
         return [self._answers[track_id] for track_id in track_ids]
@@ -75,7 +77,7 @@ def as_unchanged(error: Exception, track_ids: Sequence[int]) -> Exception:
 
 
 class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
-    """Context that turns an exception into an `EstimatorError`: the states of these tracks are as before.
+    """Context that turns an exception into an `EstimatorError` that reports these tracks as unchanged.
 
     It is a class because a generator takes three times as long.
     """
@@ -99,7 +101,10 @@ class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
 
 
 class ObjectBank(Stateful, Generic[_E]):
-    """One `Estimator` per object, made by `start`. Exceptions, but `DataError`, become an `EstimatorError`."""
+    """A bank with one `Estimator` per object, which `start` makes.
+
+    An exception becomes an `EstimatorError`, except a `DataError`.
+    """
 
     STATE: ClassVar[tuple[str, ...]] = (
         "present_ns",
@@ -113,7 +118,7 @@ class ObjectBank(Stateful, Generic[_E]):
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
         self._estimators: dict[int, _E] = {}
-        self._starts: dict[int, Start] = {}  # what each estimator began with
+        self._starts: dict[int, Start] = {}  # by track id
         self.present_ns = 0
         """See `TrackBank.present_ns`."""
 
@@ -126,7 +131,7 @@ class ObjectBank(Stateful, Generic[_E]):
         return {**super().checkpoint(), "estimators": estimators}
 
     def restore(self, snapshot: Snapshot) -> None:
-        """See `Stateful.restore`; each estimator is made again from its start, and gets its state."""
+        """See `Stateful.restore`. Each estimator is made from its start, and then gets its state."""
         super().restore(snapshot)
         self._estimators = {}
         for track_id, own in snapshot["estimators"].items():
@@ -187,7 +192,7 @@ class ObjectBank(Stateful, Generic[_E]):
         del self._estimators[track_id], self._starts[track_id]
 
     def present(self) -> Sequence[TrackState]:
-        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
+        """See `TrackBank.present`. An object whose first stamp is after the present has its first state."""
         states = self._ask(
             lambda _, item: self._state(item, max(self.present_ns, item.window_ns[0]))
         )
@@ -196,13 +201,16 @@ class ObjectBank(Stateful, Generic[_E]):
         )
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`: none."""
+        """See `TrackBank.smoothed`: always empty."""
         return []
 
     def _ask(
         self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None
     ) -> dict[int, _T]:
-        """Return the answers of all estimators, or of some, by track. Raises `EstimatorError` if some raise."""
+        """Return the results of `question` for all estimators, or for `track_ids`, by track id.
+
+        Raises `EstimatorError` if the question raises for some of them.
+        """
         answers, causes = dict[int, _T](), dict[int, Exception]()
         for track_id in self._estimators if track_ids is None else track_ids:
             try:
@@ -249,7 +257,7 @@ def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArr
 
 @contextmanager
 def _own_cause() -> Iterator[None]:
-    """Raise, instead of an `EstimatorError` of the only track, what its estimator raised."""
+    """Raise the exception of the only track instead of its `EstimatorError`."""
     try:
         yield
     except EstimatorError as error:
@@ -257,8 +265,10 @@ def _own_cause() -> Iterator[None]:
 
 
 class SingleObject(Stateful):
-    """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
-    `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
+    """A bank with one object, as an `Estimator`. The clock of the bank follows the newest stamp.
+
+    `bank` must be empty. A bank on a time grid, such as `BackwardForwardBank`, returns the state of the nearest
+    grid point.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -330,15 +340,17 @@ class SingleObject(Stateful):
         )
 
     def window(self) -> "Window":
-        """Return a copy of the window: states, prior and measurements. Raises `CallError` unless it is a smoother."""
+        """Return a copy of the window: states, prior and measurements. Raises `CallError` unless the bank is a
+        smoother.
+        """
         with _own_cause():
             return self._smoother("window").window(0)
 
     def withdraw(self, measurement: Measurement) -> None:
-        """Take a measurement back: the states become those without it.
+        """Undo the fusion of a measurement: the states become the states without this measurement.
 
-        In a linear model they are exact at once, else after `converge()` of the bank. Raises `CallError` for a
-        measurement that has left the window or was never fused, and unless the estimator is a smoother.
+        In a linear model they are exact at once, else after `converge()` of the bank. Raises `CallError` if the
+        measurement has left the window or was never fused, and if the estimator is not a smoother.
         """
         bank, stamp_ns, oldest_ns = (
             self._smoother("withdraw"),
@@ -357,7 +369,7 @@ class SingleObject(Stateful):
             )
 
     def _smoother(self, call: str) -> WindowBank:
-        """Return the bank. Raises `CallError` if it keeps no window."""
+        """Return the bank. Raises `CallError` if the bank has no windows."""
         if self._windows is None:
             raise CallError(
                 f"{call}: {self._name} keeps no window, take a smoother: smoother, smoother-batch or smoother-banded"
@@ -369,7 +381,7 @@ class SingleObject(Stateful):
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
-    """States of the tracks of `bank` whose window has begun, at any stamp, in the own form of `motion`."""
+    """Return the states of all tracks of `bank` whose windows have begun, at any stamp, in the state of `motion`."""
     return ahead_of(
         bank.states_at(min(stamp_ns, bank.present_ns)),
         bank.present_ns,
@@ -381,7 +393,9 @@ def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
 def ahead_of(
     states: StatesAt, present_ns: int, motion: MotionModel, stamp_ns: int
 ) -> StatesAt:
-    """Return `states` of the present predicted to a stamp after it; those of a stamp up to the present as they are."""
+    """Return `states` at the present predicted to a later stamp. At a stamp up to the present they are returned
+    unchanged.
+    """
     if stamp_ns <= present_ns or not states.track_ids:
         return states
     ahead = predict(
@@ -393,7 +407,9 @@ def ahead_of(
 def state_of(
     bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int
 ) -> TrackState:
-    """State of a track of `bank` at any stamp; raises `CallError` for one before the track's window."""
+    """Return the state of a track of `bank` at any stamp. Raises `CallError` for a stamp before the window of the
+    track.
+    """
     states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
         raise CallError(

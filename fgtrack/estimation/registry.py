@@ -1,7 +1,7 @@
 """All estimators and motion models by name, plug-ins included.
 
-An estimator is made by a class or function `(motion, start, lag_s, **options) -> Estimator`, or with a true attribute
-`bank` by `(motion, lag_s, **options) -> TrackBank`; a motion model by `(**parameters) -> MotionModel`.
+An estimator is a class or function `(motion, start, lag_s, **options) -> Estimator`. If it has a true attribute `bank`,
+it is `(motion, lag_s, **options) -> TrackBank` instead. A motion model is `(**parameters) -> MotionModel`.
 """
 
 import inspect
@@ -79,43 +79,50 @@ Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
 @dataclass(frozen=True)
 class Claims:
-    """Claims of an estimator, in attributes of its class or function; a missing one is the default."""
+    """Promises of an estimator, read from attributes of its class or function. A missing attribute has the default."""
 
     exact: str = ""
-    """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
-    `any lag, any number` is verified by `fgtrack verify` and `check_estimator`."""
+    """Late measurements for which the estimate in a linear model is the dense joint posterior of all accepted
+    measurements. Empty if there are no such measurements. `fgtrack verify` and `check_estimator` verify `any lag,
+    any number`.
+    """
     nonlinear: Literal["at once", "at convergence", "never"] = "at once"
-    """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the method
-    `converge()` of the estimator or bank, or never, where an estimate keeps its linearisation."""
+    """When the estimates in a nonlinear model become independent of the order of arrival. `at convergence`: after
+    the method `converge()` of the estimator or bank. `never`: an estimate keeps its linearisation.
+    """
     smooths: bool = False
-    """True if states of the past contain later measurements; a filter's do not."""
+    """True if later measurements improve states of the past. A filter does not do this."""
     tolerance: float = 1e-9
-    """Largest difference to the dense joint posterior, in standard deviations."""
+    """Largest difference from the dense joint posterior, in standard deviations."""
     rounding: float = 0.0
-    """Where stamps nearly coincide, the tolerance grows to this many times `rounding_bound` of the suite."""
+    """Factor on `rounding_bound` of the contract tests, which replaces a smaller tolerance where stamps nearly
+    coincide.
+    """
     retrodicts: bool = False
-    """True if a filter predicts the innovation of a late measurement from everything fused, as smoothers do."""
+    """True if a filter predicts the innovation of a late measurement from all fused measurements, as smoothers do."""
     iterates: bool = False
-    """True if an update of a nonlinear measurement is linearised at its own result."""
+    """True if the update with a nonlinear measurement is linearised at its own result."""
     spreads: bool = False
-    """True if predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
+    """True if predictions of a nonlinear model are averages over the spread of the state, not values at the mean."""
     mixes: bool = False
-    """True if it weighs other motion models beside the one that it is given."""
+    """True if the estimator weighs other motion models beside the given motion model."""
     held_s: float = 0.0
-    """Time that a measurement waits before it counts."""
+    """Time for which a measurement is held back before it is fused."""
     initiates: bool = False
-    """True if it estimates an unknown direction of travel, with the option `initiation`; others become `Initiated`."""
+    """True if the estimator itself estimates an unknown direction of travel, with the option `initiation`. Other
+    estimators are wrapped in `Initiated`.
+    """
     bank: bool = False
-    """True if the entry makes the estimators of all objects together."""
+    """True if the factory makes one bank for all objects."""
 
     @property
     def is_exact(self) -> bool:
-        """True if nothing late, in whatever number, changes what it gives in a linear model."""
+        """True if the estimate in a linear model does not depend on which measurements were late."""
         return self.exact == EXACT
 
     @classmethod
     def of(cls, factory: Factory) -> "Claims":
-        """Claims of `factory`."""
+        """Return the claims of `factory`."""
         return cls(
             **{
                 f.name: getattr(factory, f.name)
@@ -126,10 +133,10 @@ class Claims:
 
 
 def list_estimators(group: str | None = None) -> list[str]:
-    """Names of all estimators, those of installed plug-ins included.
+    """Return the names of all estimators, plug-ins included.
 
-    `group` selects the entries of one group of entry points: `fgtrack.estimators`, or `fgtrack.oosm` with the methods
-    for late measurements.
+    `group` selects one group of entry points: `fgtrack.estimators`, or `fgtrack.oosm` with the methods for late
+    measurements.
     """
     return ESTIMATORS.names(group)
 
@@ -143,20 +150,22 @@ def estimator_claims(name: str) -> Claims:
 def estimator(
     name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.0, **options: Any
 ) -> Estimator:
-    """The estimator `name` of one object.
+    """Return the estimator `name` of one object.
+
+    It answers `duplicate` to a measurement that is identical to a fused measurement.
 
     Parameters
     ----------
     name
         One of `list_estimators()`.
     motion, start
-        Motion model, and the state at the first stamp; nothing older can be fused.
+        Motion model, and the state at the first stamp. Older measurements cannot be fused.
     lag_s
         Length of the window behind the newest stamp or the clock.
     options
-        Keyword parameters of that estimator, and `initiation` of every one, see `Initiation`.
+        Keyword parameters of this estimator. Every estimator has `initiation`, see `Initiation`.
 
-    Raises `CallError` for an unknown name, and for options that the estimator does not take.
+    Raises `CallError` for an unknown name, and for an option that the estimator does not have.
     """
     for what, value, kind in (
         ("name", name, str),
@@ -183,7 +192,7 @@ def start_estimator(
     lag_s: float,
     options: Mapping[str, Any],
 ) -> Estimator:
-    """`estimator` of a factory that need not be registered; `name` stands in errors."""
+    """Return the estimator of one object from a `factory`, which need not be registered. Errors contain its `name`."""
     claims, own = Claims.of(factory), dict(options)
     method = "one-point" if claims.initiates else own.pop("initiation", DEFAULT)
 
@@ -210,7 +219,10 @@ def estimator_bank(
     options: Mapping[str, Any],
     factory: Factory | None = None,
 ) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. A `factory` needs no entry."""
+    """Return the bank of the estimators `name` of all objects. Raises as `estimator`.
+
+    With a `factory` the name need not be registered.
+    """
     factory = factory or ESTIMATORS.load(name)
     claims = Claims.of(factory)
     own = {
@@ -230,7 +242,7 @@ def estimator_bank(
 
 
 def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
-    """The motion model `name`. Raises `CallError` for an unknown name and for parameters that it does not take."""
+    """Return the motion model `name`. Raises `CallError` for an unknown name, and for an unknown parameter."""
     model: MotionModel = _made(
         MOTION_MODELS, MotionModel, name, MOTION_MODELS.load(name), **parameters
     )
@@ -245,7 +257,7 @@ def _made(
     *arguments: Any,
     **options: Any,
 ) -> Any:
-    """Return what the part `name` makes. Raises `CallError` where that is not of its `kind`."""
+    """Return the result of the `factory` of `name`. Raises `CallError` unless the result has the members of `kind`."""
     _check_options(name, factory, len(arguments), options)
     with registry.plugin_errors(name, "cannot be made"):
         try:
@@ -263,7 +275,9 @@ def _check_options(
     name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]
 ) -> None:
     if not callable(factory):
-        raise CallError(f"{name}: {factory!r} is no class or function of Python")
+        raise CallError(
+            f"{name}: {factory!r} is not a class or function: correct the entry point"
+        )
     signature = inspect.signature(factory)
     try:
         signature.bind(*[None] * num_arguments, **options)

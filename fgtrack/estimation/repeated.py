@@ -16,10 +16,10 @@ class MeasurementKeeper(Estimator, Protocol):
 
 
 class FusedOnce(Stateful):
-    """An `Estimator` that answers `duplicate` to a measurement that is identical to a fused measurement.
+    """Wrapper of an `Estimator` that answers `duplicate` to a measurement identical to a fused measurement.
 
-    A bank fuses both measurements, because two sensors may measure equal values. All other attributes are those of the
-    wrapped estimator.
+    A bank fuses both measurements, because two sensors may measure equal values. All other attributes are those of
+    the wrapped estimator.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_inner",)

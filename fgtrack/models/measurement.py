@@ -1,8 +1,8 @@
 """Measurement models: any subset of the measurable components, seen from a sensor pose.
 
-x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the heading. range_m, bearing_rad
-(0 along the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor. curvature_radpm, left
-turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map gives it.
+x_m, y_m and yaw_rad are in the map frame, and speed_mps is over ground along the heading. range_m, bearing_rad (0 along
+the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor. curvature_radpm is the yaw rate
+of the object over its speed, positive for a left turn. No sensor measures a curvature: it comes from the map.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,11 +18,11 @@ from fgtrack.core.linalg import kernels
 from fgtrack.core.types import MEASURABLE, STATE_NAMES, FloatArray, IntArray
 from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
 
-#: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
+#: The derivative of a bearing by the position grows as 1 / range. Below this range it is constant.
 MIN_RANGE_M = 1e-6
-#: Far below this speed a curvature gives no yaw rate: an object at rest has no way that could turn.
+#: Far below this speed a curvature has no effect on the yaw rate: an object at rest follows no curve.
 SLOW_MPS = 1.0
-#: What a measurement may be of: what a detection measures, and what the map gives for a moving object.
+#: Components of measurements: the components that a detection measures, and the curvature from the map.
 COMPONENTS = (*MEASURABLE, "curvature_radpm")
 _KERNELS = "fgtrack.models.measurement_kernels"
 #: Components that are angles.
@@ -46,15 +46,15 @@ AT_ORIGIN = SensorPose()
 
 @dataclass(frozen=True)
 class MeasurementModel:
-    """Measurement of a state, z = h(x, pose) + noise; `measurement_model` gives a shared one.
+    """Measurement of a state, z = h(x, pose) + noise. `measurement_model` returns shared models.
 
-    A state may have more entries than `state_names`. Raises `CallError` for components or states that are not known.
+    A state may have more entries than `state_names`. Raises `CallError` for unknown components or states.
     """
 
     components: tuple[str, ...]
-    """Measured components, a non-empty subset of `COMPONENTS` in that order."""
+    """Measured components: a non-empty subset of `COMPONENTS` in that order."""
     state_names: tuple[str, ...]
-    """Names of the entries of the state: x, y and either yaw, speed or vx, vy, and what follows."""
+    """Names of the entries of the state: x, y and either yaw, speed or vx, vy, then further entries."""
 
     def __post_init__(self) -> None:
         if not self.components or self.components != tuple(
@@ -97,17 +97,21 @@ class MeasurementModel:
 
     @cached_property
     def linear(self) -> bool:
-        """True if the measurement selects entries of the state, whatever the sensor pose."""
+        """True if the measurement selects entries of the state, for every sensor pose."""
         return set(self.components) <= set(self.state_names)
 
     def predict(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
-        """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
+        """Return the measurement expected for the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
             return x.take(self.selected, axis=-1)
         return self._observed(self.codes, x, pose)[0]
 
     def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
-        """Derivative H of `predict` by `x`, (..., k, n), read-only of a linear model; finite, see `MIN_RANGE_M`."""
+        """Return the derivative H of `predict` by `x`, shape (..., k, n). It is always finite, see
+        `MIN_RANGE_M`.
+
+        The H of a linear model is read-only.
+        """
         if self.linear:
             n = x.shape[-1]
             shape = (*x.shape[:-1], len(self.components), n)
@@ -117,7 +121,7 @@ class MeasurementModel:
     def predict_with_jacobian(
         self, x: FloatArray, pose: SensorPose = AT_ORIGIN
     ) -> tuple[FloatArray, FloatArray]:
-        """Return `predict` (..., k), and `jacobian`, of a linear model one (k, n) for all states."""
+        """Return `predict` (..., k) and `jacobian`. A linear model returns one Jacobian (k, n) for all states."""
         if self.is_compiled and not self.linear:
             return self._observed(self.codes, x, pose)
         H = self.selection(x.shape[-1]) if self.linear else self.jacobian(x, pose)
@@ -130,14 +134,16 @@ class MeasurementModel:
         pose: SensorPose = AT_ORIGIN,
         residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
-        `residual` may replace the model's own.
+        """Return the innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H, (k, n)
+        or (..., k, n).
+
+        `residual` may replace the residual of this model.
         """
         h, H = self.predict_with_jacobian(x, pose)
         return (residual or self.residual)(z, h), H
 
     def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
-        """Derivative of `predict` by the entries of `pose`, shape (..., k, 5); finite as `jacobian` is."""
+        """Return the derivative of `predict` by the entries of `pose`, shape (..., k, 5); finite as `jacobian`."""
         D = np.zeros((*x.shape[:-1], len(self.components), len(pose)))
         if not self.relative:
             return D
@@ -152,7 +158,7 @@ class MeasurementModel:
         return D
 
     def selection(self, n: int) -> FloatArray:
-        """`jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""
+        """Return the `jacobian` of a linear model at any state of `n` entries, shape (k, n), read-only."""
         if n not in self._selections:
             H = np.eye(n)[self.selected]
             H.flags.writeable = False
@@ -160,7 +166,9 @@ class MeasurementModel:
         return self._selections[n]
 
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
-        """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only function that wraps."""
+        """Return measured minus predicted values, shape (..., k), with angles in (-pi, pi]. No other function
+        wraps angles.
+        """
         y = np.array(z - z_predicted, dtype=np.float64, order="C")
         if self.angular:
             kernels(_KERNELS).wrap(self.codes, y.reshape(-1, y.shape[-1]))
@@ -179,13 +187,15 @@ class MeasurementModel:
 
     @property
     def is_compiled(self) -> bool:
-        """True if compiled loops may take the shipped equations: no subclass has replaced a part of them."""
+        """True if compiled loops may use the shipped equations, because no subclass has replaced a part of them."""
         return type(self) is MeasurementModel
 
     def _observed(
         self, codes: IntArray, x: FloatArray, pose: SensorPose
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (..., k) of the components `codes`, and their derivatives by the state, shape (..., k, n)."""
+        """Return the values (..., k) of the components `codes`, and their derivatives by the state, shape (...,
+        k, n).
+        """
         k, n = len(codes), x.shape[-1]
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
         h, H = np.empty((len(states), k)), np.empty((len(states), k, n))
@@ -200,14 +210,16 @@ class MeasurementModel:
 
     @cached_property
     def selected(self) -> IntArray:
-        """Where the components of a linear model are in the state, shape (k,)."""
+        """Indices in the state of the components of a linear model, shape (k,)."""
         return np.array([self.state_names.index(name) for name in self.components])
 
 
 def measurement_model(
     components: tuple[str, ...], motion_model: MotionModel
 ) -> MeasurementModel:
-    """The measurement of `components` for the state of `motion_model`: one shared object for each."""
+    """Return the measurement of `components` for the state of `motion_model`: one shared object for each
+    combination.
+    """
     return _shared_model(components, motion_model.state_names)
 
 
@@ -221,7 +233,10 @@ def _shared_model(
 def measured_position(
     components: tuple[str, ...], z: FloatArray, R: FloatArray, pose: SensorPose
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Position in the map (2,), and covariance (2, 2), of x and y, or to first order of range and bearing; or None."""
+    """Return the measured position in the map (2,) and its covariance (2, 2); None if z has no position.
+
+    The position comes from x and y, or to first order from range and bearing.
+    """
     if components[:2] == ("x_m", "y_m"):
         return z[:2], R[:2, :2]
     G = position_gradient(components, z, pose)
@@ -234,7 +249,7 @@ def measured_position(
 def position_gradient(
     components: tuple[str, ...], z: FloatArray, pose: SensorPose
 ) -> FloatArray | None:
-    """Derivative of what `measured_position` gives by z, shape (2, k); None where z holds no position."""
+    """Derivative of the position from `measured_position` by z, shape (2, k); None if z has no position."""
     G = np.zeros((2, len(components)))
     if components[:2] == ("x_m", "y_m"):
         G[:, :2] = np.eye(2)

@@ -1,11 +1,11 @@
 """Transitions of the shipped motion models, compiled: mean, Jacobian F and noise covariance Q of states after a time.
 
-The noise is the definition, Q = integral over s in [0, t] of Phi(t, s) D Phi(t, s)', with the diagonal D of spectral
-densities at the mean at s, and the Jacobian Phi(t, s) of the flow from there over t - s.
+By definition, Q is the integral over s in [0, t] of Phi(t, s) D Phi(t, s)'. D is the diagonal of spectral densities at
+the mean at s. Phi(t, s) is the Jacobian of the flow from s to t.
 
-The parameters `noise` are the spectral densities of the entries of the state, shape (n,). Those of `ARC` and `TURN`
-are followed by the rate at which the yaw rate relaxes, in 1/s. Those of `ARC` end with the speed below which an object
-counts as slow, in m/s, and with the density that is added to that of the yaw of an object at rest, in rad^2/s.
+The parameters `noise` begin with the spectral densities of the entries of the state, shape (n,). For `ARC` and `TURN`
+the rate at which the yaw rate relaxes follows, in 1/s. For `ARC` two more numbers follow: the speed below which an
+object counts as slow, in m/s, and the additional density of the yaw of an object at rest, in rad^2/s.
 """
 
 import math
@@ -70,6 +70,8 @@ _TURN_BY_RATE, _RATE_BY_RATE, _SPEED_BY_ACCEL, _ACCEL_BY_ACCEL = 8, 9, 10, 11
 # Row of the factor t^2 / p, and the number of rows.
 _SHARE, _NUM_EFFECTS = 12, 13
 
+Bend = tuple[float, float, float, float]
+"""Yaw rate w in the middle, b, g(1/2) and g(-1/2), see `_short`."""
 _TYPES = (
     f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
 )
@@ -90,7 +92,7 @@ def check_noise(kind: int, noise: FloatArray, n: int) -> None:
 def _angles(r: float, b: float) -> tuple[float, float]:
     """Return g(r) and g(-r), with g(r) = (exp(b r) - 1) / b, for |b| <= `MAX_RELAXATION` and 0 < r <= 1/2.
 
-    They are the sum and the difference of a symmetric part, (cosh(b r) - 1) / b, and an antisymmetric part,
+    The results are the sum and the difference of a symmetric part, (cosh(b r) - 1) / b, and an antisymmetric part,
     sinh(b r) / b.
     """
     square = (b * r) * (b * r)
@@ -105,7 +107,10 @@ def _angles(r: float, b: float) -> tuple[float, float]:
 
 @inlined
 def _direction(angle: float) -> tuple[float, float]:
-    """Cosine and sine of an angle of at most 0.152 rad, the largest angle between the middle and an end of a part."""
+    """Return cosine and sine of an angle of at most 0.152 rad.
+
+    No angle between the middle and an end of a part is larger.
+    """
     square = angle * angle
     cosine, sine = 0.0, 0.0
     for k in range(_NUM_TERMS - 1, -1, -1):
@@ -116,7 +121,7 @@ def _direction(angle: float) -> tuple[float, float]:
 
 @inlined
 def _write_directions(w: float, t: float, b: float, at: FloatArray) -> None:
-    """Write g and the direction U = exp(-i w t g) at each node to rows of `at` (rows, nodes), see `_write_arc`."""
+    """Write g and the direction U = exp(-i w t g) at each node to rows of `at` (rows, nodes), see `_short`."""
     middle = _NUM_NODES // 2
     at[_G, middle], at[_UNIT_X, middle], at[_UNIT_Y, middle] = 0.0, 1.0, 0.0
     for j in range(middle):
@@ -144,7 +149,10 @@ def _integrate(num_rows: int, at: FloatArray, integrals: FloatArray) -> None:
 def _sums(
     weights: FloatArray, effect: FloatArray, row: int
 ) -> tuple[float, float, float, float, float]:
-    """Weighted sums of x x, x y, y y, x and y over the nodes; x and y are the rows of `effect` from `row` on."""
+    """Return the weighted sums over the nodes of x x, x y, y y, x and y.
+
+    x and y are the rows of `effect` from `row` on.
+    """
     xx, xy, yy, sum_x, sum_y = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(_NUM_NODES):
         x, y = effect[row, i], effect[row + 1, i]
@@ -161,9 +169,10 @@ def _sums(
 def _coupled_sums(
     effect: FloatArray, row: int, own: int
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Weighted sums over the nodes of x x, x y, y y, x a, y a, x b, y b, a a, a b and b b.
+    """Return the weighted sums over the nodes of all products of x and y, of x and y with a and b, and of a and b.
 
-    x and y are the rows of `effect` from `row` on, a and b the rows from `own` on.
+    The order is x x, x y, y y, x a, y a, x b, y b, a a, a b, b b. x and y are the rows of `effect` from `row` on, a
+    and b the rows from `own` on.
     """
     xx, xy, yy, xa, ya, xb, yb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     aa, ab, bb = 0.0, 0.0, 0.0
@@ -208,7 +217,10 @@ def _write_rate_effects(
 def _write_column(
     M: FloatArray, k: int, x: float, y: float, c: float, s: float
 ) -> None:
-    """Write x along and y left of the heading with this cosine and sine to the rows of the position in column k."""
+    """Write a displacement into the rows of the position in column k of M.
+
+    The displacement is x along and y left of the heading with the cosine c and the sine s.
+    """
     M[0, k] = c * x - s * y
     M[1, k] = s * x + c * y
 
@@ -257,8 +269,12 @@ def _write_arc_effects(
 ) -> None:
     """Write the effects of the state at each node, and at the beginning, on the final position.
 
-    The integrals run from the end to r. The effect of the yaw is i t int V, of the speed t int U, of the yaw rate
-    i t^2 (g(r) int V - int g V) / p(r), and of the acceleration t^2 (r int U - int s U).
+    All integrals run from the end to r. The effects are:
+
+    - of the yaw: i t int V;
+    - of the speed: t int U;
+    - of the yaw rate: i t^2 (g(r) int V - int g V) / p(r);
+    - of the acceleration: t^2 (r int U - int s U).
     """
     for i in range(_NUM_NODES + 1):
         is_node = i < _NUM_NODES
@@ -358,34 +374,28 @@ def _write_arc(
     x: FloatArray,
     t: float,
     noise: FloatArray,
+    bend: Bend,
+    at: FloatArray,
+    integrals: FloatArray,
+    effect: FloatArray,
     mean: FloatArray,
     F: FloatArray,
     Q: FloatArray,
 ) -> None:
-    """Write mean, F and Q of the state x, y, yaw, speed, yaw rate and, for n = 6, acceleration after a short arc.
+    """Write mean, F and Q of the state x, y, yaw, speed, yaw rate and, for n = 6, acceleration, see `_short`.
 
-    Positions are complex numbers along and left of the heading in the middle of the arc. At a time r t before the
-    middle the yaw rate is w p(r) and the heading is -w t g(r). Here w is the yaw rate in the middle, p = exp(b r),
-    g = (p - 1) / b, and b is t times the rate of relaxation. So r is 1/2 at the beginning and -1/2 at the end. F has
-    the effects of the state at the beginning on the state at the end. Q is the integral over r of products of effects.
+    Positions are complex numbers along and left of the heading in the middle of the arc.
     """
+    w, _, first_g, last_g = bend
     accel = x[5] if n > 5 else 0.0
-    b = noise[n] * t
-    first_g, last_g = _angles(0.5, b)
-    w, v = x[4] / (1.0 + b * first_g), x[3] + 0.5 * accel * t
+    v = x[3] + 0.5 * accel * t
     yaw = x[2] + w * t * first_g
     c, s = math.cos(yaw), math.sin(yaw)
-    at, integrals = scratch(_NUM_ROWS, _NUM_NODES), scratch(_NUM_ROWS, _NUM_NODES + 1)
-    effect = scratch(_NUM_EFFECTS, _NUM_NODES + 1)
-    _write_directions(w, t, b, at)
     _write_arc_integrals(n, v, accel, t, at, integrals)
-    _write_rate_effects(b, t, first_g, last_g, at, effect)
     _write_arc_effects(n, v, accel, t, first_g, at, integrals, effect)
     speed_sums = _sums(_WEIGHTS, effect, _BY_SPEED)
     yaw_sums = _yaw_sums(n, v, accel, t, noise, speed_sums, effect)
     _write_arc_noise(n, t, noise, c, s, speed_sums, yaw_sums, effect, Q)
-    _mirror(n, Q)
-    _write_identity(n, F)
     first = _NUM_NODES
     for k in range(2, n):
         row = 2 * (k - 2)
@@ -401,22 +411,6 @@ def _write_arc(
         F[3, 5], mean[5] = t, accel
 
 
-@shared(f"void({_TYPES})")
-def _short_arc(
-    x: FloatArray,
-    t: float,
-    noise: FloatArray,
-    mean: FloatArray,
-    F: FloatArray,
-    Q: FloatArray,
-) -> None:
-    """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`: `_write_arc`, compiled for 5 and for 6 states."""
-    if len(x) == 5:
-        _write_arc(5, x, t, noise, mean, F, Q)
-    else:
-        _write_arc(6, x, t, noise, mean, F, Q)
-
-
 @inlined
 def _write_turn_effects(
     vx: float,
@@ -427,7 +421,7 @@ def _write_turn_effects(
     integrals: FloatArray,
     effect: FloatArray,
 ) -> None:
-    """Write t int U at each node and at the beginning, and the effect of the yaw rate there on the final position."""
+    """Write t int U, and the effect of the yaw rate on the final position, for each node and for the beginning."""
     for i in range(_NUM_NODES + 1):
         g, share = at[_G, i] if i < _NUM_NODES else first_g, effect[_SHARE, i]
         unit_x, unit_y = integrals[_UNIT_X, i], integrals[_UNIT_Y, i]
@@ -473,52 +467,44 @@ def _write_turn_noise(
     Q[4, 4] = r * rate[9]
 
 
-@shared(f"void({_TYPES})")
-def _short_turn(
+@inlined
+def _write_turn(
     x: FloatArray,
     t: float,
     noise: FloatArray,
+    bend: Bend,
+    at: FloatArray,
+    integrals: FloatArray,
+    effect: FloatArray,
     mean: FloatArray,
     F: FloatArray,
     Q: FloatArray,
 ) -> None:
-    """Write mean, F and Q of the state x, y, vx, vy, yaw rate after a turn of at most `MAX_TURN_RAD`.
+    """Write mean, F and Q of the state x, y, vx, vy, yaw rate, see `_short`.
 
-    As in `_write_arc`, with complex numbers in the map. The velocity is V U(r) with the velocity V in the middle. A
-    velocity d added at r becomes d U(-1/2) / U(r) at the end and moves the position by d t int U / U(r). A yaw rate
+    Positions and velocities are complex numbers in the map. The velocity is V U(r) with the velocity V in the middle.
+    A velocity d added at r becomes d U(-1/2) / U(r) at the end. It moves the position by d t int U / U(r). A yaw rate
     added at r turns the final velocity by t (g(r) - g(-1/2)) / p(r). It moves the position by
     i t^2 V (g(r) int U - int g U) / p(r). Bar-Shalom, Li and Kirubarajan (2001), section 11.7, have the model with a
     yaw rate that does not relax.
     """
-    b = noise[5] * t
-    first_g, last_g = _angles(0.5, b)
-    w = x[4] / (1.0 + b * first_g)
+    w, _, first_g, last_g = bend
     first_x, first_y = _direction(-w * t * first_g)
     last_x, last_y = _direction(-w * t * last_g)
-    middle_vx, middle_vy = (
-        first_x * x[2] + first_y * x[3],
-        first_x * x[3] - first_y * x[2],
-    )
+    middle_vx = first_x * x[2] + first_y * x[3]
+    middle_vy = first_x * x[3] - first_y * x[2]
     vx = last_x * middle_vx - last_y * middle_vy
     vy = last_x * middle_vy + last_y * middle_vx
-    at, integrals = scratch(_NUM_ROWS, _NUM_NODES), scratch(_NUM_ROWS, _NUM_NODES + 1)
-    effect = scratch(_NUM_EFFECTS, _NUM_NODES + 1)
-    _write_directions(w, t, b, at)
     for j in range(_NUM_NODES):
         at[_TURNED_X, j] = at[_G, j] * at[_UNIT_X, j]
         at[_TURNED_Y, j] = at[_G, j] * at[_UNIT_Y, j]
     _integrate(4, at, integrals)
-    _write_rate_effects(b, t, first_g, last_g, at, effect)
     _write_turn_effects(middle_vx, middle_vy, t, first_g, at, integrals, effect)
     _write_turn_noise(t, noise, last_x, last_y, vx, vy, effect, Q)
-    _mirror(5, Q)
-    _write_identity(5, F)
     first = _NUM_NODES
     unit_x, unit_y = effect[_BY_SPEED, first], effect[_BY_SPEED + 1, first]
-    way_x, way_y = (
-        unit_x * first_x + unit_y * first_y,
-        unit_y * first_x - unit_x * first_y,
-    )
+    way_x = unit_x * first_x + unit_y * first_y
+    way_y = unit_y * first_x - unit_x * first_y
     c, s = last_x * first_x + last_y * first_y, last_y * first_x - last_x * first_y
     F[0, 2], F[0, 3], F[1, 2], F[1, 3] = way_x, -way_y, way_y, way_x
     F[2, 2], F[2, 3], F[3, 2], F[3, 3] = c, -s, s, c
@@ -528,6 +514,42 @@ def _short_turn(
     mean[0] = x[0] + way_x * x[2] - way_y * x[3]
     mean[1] = x[1] + way_y * x[2] + way_x * x[3]
     mean[2], mean[3], mean[4] = vx, vy, F[4, 4] * x[4]
+
+
+@shared(f"void(int64, {_TYPES})")
+def _short(
+    kind: int,
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+) -> None:
+    """Write mean, F and Q of an arc or a turn of at most `MAX_TURN_RAD`.
+
+    At a time r t before the middle the yaw rate is w p(r) and the heading is -w t g(r). Here w is the yaw rate in the
+    middle, p = exp(b r) and g = (p - 1) / b, with b = t times the rate of relaxation. So r is 1/2 at the beginning and
+    -1/2 at the end. F has the effects of the state at the beginning on the state at the end. Q is the integral over r
+    of products of effects.
+    """
+    n = len(x)
+    b = noise[n] * t
+    first_g, last_g = _angles(0.5, b)
+    w = x[4] / (1.0 + b * first_g)
+    at, integrals = scratch(_NUM_ROWS, _NUM_NODES), scratch(_NUM_ROWS, _NUM_NODES + 1)
+    effect = scratch(_NUM_EFFECTS, _NUM_NODES + 1)
+    _write_directions(w, t, b, at)
+    _write_rate_effects(b, t, first_g, last_g, at, effect)
+    _write_identity(n, F)
+    bend = w, b, first_g, last_g
+    if kind == TURN:
+        _write_turn(x, t, noise, bend, at, integrals, effect, mean, F, Q)
+    elif n == 5:  # compiled for 5 and for 6 entries, which is faster
+        _write_arc(5, x, t, noise, bend, at, integrals, effect, mean, F, Q)
+    else:
+        _write_arc(6, x, t, noise, bend, at, integrals, effect, mean, F, Q)
+    _mirror(n, Q)
 
 
 @merged
@@ -549,10 +571,7 @@ def _arc(
             before[j] = mean[j]
         if part:
             copy(Q, old)
-        if kind == ARC:
-            _short_arc(before if part else x, t, noise, mean, G if part else F, Q)
-        else:
-            _short_turn(before if part else x, t, noise, mean, G if part else F, Q)
+        _short(kind, before if part else x, t, noise, mean, G if part else F, Q)
         if part:
             product(G, old, GM)
             add_product_transposed(GM, G, Q)

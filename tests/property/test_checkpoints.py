@@ -343,7 +343,7 @@ def test_a_file_runs_no_code() -> None:
         def __reduce__(self) -> tuple[Any, tuple[str]]:
             return os.system, ("true",)
 
-    with pytest.raises(DataError, match=r"posix\.system, which is no state"):
+    with pytest.raises(DataError, match=r"posix\.system, which is not a state"):
         from_bytes(pickle.dumps(Evil()))
 
 

@@ -1,4 +1,4 @@
-"""The extended Kalman filter's two steps, on stacks of independent states."""
+"""The two steps of the extended Kalman filter, predict and correct, on stacks of independent states."""
 
 import math
 from functools import partial
@@ -24,17 +24,17 @@ _KALMAN = "fgtrack.estimation.kernels.kalman"
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
-    """Covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
+    """Return the covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
     return symmetrise(congruence(F, P) + Q)
 
 
 def robust_weight(
     loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray
 ) -> float:
-    """Weight of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss; 1 without.
+    """Return the weight under a robust loss of an innovation y (k,) with covariance `spread` + R, both (k, k).
 
-    See `fgtrack.estimation.kernels.kalman.robust_weight`. Raises `numpy.linalg.LinAlgError` where the covariance is not
-    positive definite.
+    The weight is 1 without a loss. See `fgtrack.estimation.kernels.kalman.robust_weight`. Raises
+    `numpy.linalg.LinAlgError` if the covariance is not positive definite.
     """
     if loss is None:
         return 1.0
@@ -48,7 +48,7 @@ def robust_weight(
 
 
 class Correction(NamedTuple, Generic[T]):
-    """Result of fusing a measurement into one state, or into each of m states; shapes then begin with m."""
+    """Result of the correction of one state. For m states each array has m as first dimension."""
 
     mean: FloatArray
     """Posterior mean, shape (n,); angles are not wrapped."""
@@ -59,7 +59,7 @@ class Correction(NamedTuple, Generic[T]):
     nis: T
     """Normalised innovation squared."""
     weight: T
-    """Weight of the measurement under its loss; 1 at most."""
+    """Weight of the measurement under its loss, at most 1."""
     S: FloatArray
     """Covariance of the innovation, shape (k, k), before any loss."""
     fused: BoolArray = np.ones(1, dtype=bool)
@@ -70,14 +70,16 @@ OneCorrection = Correction[float]
 
 
 class Prediction(NamedTuple):
-    """A state after some time, or a stack of them, and how it depends on that before."""
+    """A predicted state, or a stack of predicted states, with its covariance with the state before."""
 
     mean: FloatArray
     """Shape (..., n); angles are not wrapped."""
     covariance: FloatArray
     """Shape (..., n, n)."""
     cross: FloatArray
-    """Covariance of the state after (rows) and before (columns), of first order F P; shape (..., n, n)."""
+    """Covariance of the predicted state (rows) with the state before (columns), F P to first order; shape (..., n,
+    n).
+    """
 
 
 def predict(
@@ -86,7 +88,10 @@ def predict(
     motion: MotionModel,
     dt_s: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (..., n) and covariance (..., n, n) after `dt_s` (...): f(x), F P F' + Q (Karle et al. 2023, eqs. 3, 4)."""
+    """Return the mean f(x) (..., n) and the covariance F P F' + Q (..., n, n) after `dt_s` (...).
+
+    Source: Karle et al. 2023, eqs. 3 and 4.
+    """
     return predict_across(mean, covariance, motion, dt_s)[:2]
 
 
@@ -96,7 +101,7 @@ def predict_across(
     motion: MotionModel,
     dt_s: FloatArray | float,
 ) -> Prediction:
-    """`predict`, and the cross-covariance of both states, which is half way to the covariance."""
+    """Return `predict`, together with the cross-covariance F P of both states."""
     after, F, Q = motion.transition(mean, dt_s)
     shape, n = Q.shape, Q.shape[-1]
     F, P, Q = (
@@ -115,8 +120,10 @@ def correct(
     measured: IntArray | None = None,
     loss: RobustLoss | None = None,
 ) -> Correction[FloatArray]:
-    """Fuse innovations y (m, k) with Jacobians H (m, k, n) or (k, n) and R (m, k, k) (Karle et al. 2023, eqs. 5 to 9).
-    `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
+    """Fuse innovations y (m, k), with Jacobians H (m, k, n) or (k, n) and covariances R (m, k, k), into m states.
+
+    `measured` has the indices of the components that count for the NIS, see `Measurement.measured`. `loss` is the
+    robust loss of all measurements, see `robust_weight`. Source: Karle et al. 2023, eqs. 5 to 9.
     """
     rows = np.arange(y.shape[-1]) if measured is None else measured
     m, x, P, H = len(mean), _copied(mean), _copied(covariance), stacked(H)
@@ -137,8 +144,9 @@ def updated_one(
     loss: RobustLoss | None = None,
     measured: IntArray | None = None,
 ) -> OneCorrection:
-    """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
-    Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
+    """Return one state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
+
+    Raises `numpy.linalg.LinAlgError` if the measurement cannot be fused.
     """
     x, P, y, nis, w, S, fused = correct(
         mean[None], covariance[None], y[None], H, R[None], measured, loss
@@ -153,7 +161,7 @@ def updated_one(
 def correct_one(
     mean: FloatArray, covariance: FloatArray, measurement: Measurement
 ) -> OneCorrection:
-    """`correct` of one state, shapes (n,) and (n, n). Raises as `updated_one`."""
+    """Return one state, shapes (n,) and (n, n), after `measurement`. Raises as `updated_one`."""
     y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
     return updated_one(
         mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured

@@ -73,7 +73,8 @@ class ImmReplay(ReplayEkf):
         ]
 
     def transition(self, dt_s: float) -> FloatArray:
-        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m), which composes.
+        """Return the probability of model j (columns) `dt_s` after model i (rows), shape (m, m). The matrices
+        compose.
 
         exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) / m, with r = m over the mean sojourn time.
         """
@@ -128,9 +129,11 @@ class ImmReplay(ReplayEkf):
         return replace(step, mixture=posterior), correction
 
     def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
-        """The mixture at `stamp_ns`: each model predicts the mixture before, given that the object follows it now."""
+        """Return the mixture at `stamp_ns`, after mixing: for each model, the Gaussian given that the object
+        follows this model now.
+        """
         old = before.mixture
-        assert old is not None  # every step of this filter has one
+        assert old is not None  # every step of this filter has a mixture
         if stamp_ns == before.stamp_ns:
             return old
         dt_s = seconds(stamp_ns - before.stamp_ns)
@@ -148,7 +151,7 @@ class ImmReplay(ReplayEkf):
     def _moments(
         self, mixture: Mixture, weights: FloatArray, model: MotionModel
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
+        """Return mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
         states = [
             _converted(each, model, mean, covariance)
             for each, mean, covariance in zip(
@@ -172,7 +175,7 @@ class ImmReplay(ReplayEkf):
 def _converted(
     model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A state of `model` in the form of another one that is `wanted`."""
+    """Return a state of `model` as a state of the model `wanted`."""
     if model.state_names == wanted.state_names:
         return mean, covariance
     if model.cartesian and wanted.cartesian:
@@ -188,7 +191,9 @@ def _converted(
 
 
 def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None:
-    """The other model. Raises `CallError` where there is none of that name, or `motion` cannot be one of two."""
+    """Return the second model. Raises `CallError` if its name is unknown, or if `motion` cannot be one of two
+    models.
+    """
     if isinstance(motion, CorrelatedErrors):
         raise CallError("takes no sensors with correlated errors")
     if isinstance(other, MotionModel):
@@ -214,7 +219,10 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
 
 
 def _log_likelihood(corrected: OneCorrection, measurement: Measurement) -> float:
-    """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
+    """Return the log-likelihood of the innovation by one model, under the loss of the measurement.
+
+    Terms that all models share are left out.
+    """
     distance = math.sqrt(
         max(float(mahalanobis_squared(corrected.innovation, corrected.S)), 0.0)
     )

@@ -17,21 +17,22 @@ from fgtrack.models.measurement import measured_position
 from fgtrack.models.motion import MotionModel
 
 Initiation = Literal["one-point", "two-point", "regression"]
-"""Methods to estimate the direction of travel of a new object where neither map nor sensor gives one.
+"""Methods that estimate the direction of travel of a new object if neither the map nor the sensor gives a direction.
 
-- `one-point`: none; the state starts at yaw 0 with a wide standard deviation.
+- `one-point`: no estimate; the state starts at yaw 0 with a wide standard deviation.
 - `two-point`: from the first two positions (Bar-Shalom, Li and Kirubarajan 2001, section 5.5.3).
-- `regression`: from a weighted least-squares line through the first positions (the same, section 3.5), until the
-  velocity is three standard deviations from zero for a smoother, which relinearises, and ten (0.1 rad) for a filter.
+- `regression`: from a weighted least-squares line through the first positions (the same, section 3.5). The line is
+  repeated until its velocity is significantly different from zero: by three standard deviations for a smoother, which
+  relinearises, and by ten (0.1 rad) for a filter.
 """
 DEFAULT: Initiation = "regression"
-#: For a smoother, a line that is so many standard deviations from standing still is the last one: the solver finds the
-#: rest, in so many Gauss-Newton steps at most.
+#: For a smoother, a line is the last one if its velocity is this number of standard deviations from zero. The solver
+#: then converges in at most this number of Gauss-Newton steps.
 CERTAIN_TO_SMOOTHER, SMOOTHER_ITERATIONS = 3.0, 10
 
 
 def checked_initiation(method: str) -> Initiation:
-    """`method`; raises `CallError` for one that does not exist."""
+    """Return `method`. Raises `CallError` for an unknown method."""
     if method not in get_args(Initiation):
         raise CallError(
             f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}"
@@ -50,7 +51,7 @@ class Fix(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Position and velocity at time 0, and how well the velocity is known."""
+    """A straight line: position and velocity at time 0, with the covariance of the velocity."""
 
     position_m: FloatArray
     velocity_mps: FloatArray
@@ -59,7 +60,7 @@ class Line(NamedTuple):
 
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
-    """The position that `measurement` gives; None where it gives none: a bearing alone, a range alone."""
+    """Return the position in `measurement`; None if it has no position, for example a bearing or a range alone."""
     position = measured_position(
         measurement.model.components, measurement.z, measurement.R, measurement.pose
     )
@@ -69,7 +70,9 @@ def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
 def fixes_of(
     mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[float, Measurement]]
 ) -> list[Fix]:
-    """The position of a first state, (n,) and (n, n), at time 0, and those of the measurements `later` with times."""
+    """Return the position of a first state, (n,) and (n, n), at time 0, and the positions of the `later`
+    measurements.
+    """
     fixes = [fix_of(measurement, time_s) for time_s, measurement in later]
     return [
         Fix(0.0, mean[:2], covariance[:2, :2]),
@@ -78,8 +81,10 @@ def fixes_of(
 
 
 def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
-    """Least-squares lines at constant velocity through the first `least` fixes, and through each one more.
-    Raises `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
+    """Return least-squares lines at constant velocity: through the first `least` fixes, and through each further
+    fix.
+
+    Raises `numpy.linalg.LinAlgError` if all fixes have the same time, or if a fix has no uncertainty.
     """
     information, vector = (
         np.zeros((4, 4)),
@@ -98,28 +103,37 @@ def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
 
 @dataclass(frozen=True)
 class Search:
-    """Time for which a smoother restarts along a straight line through the first positions of an object.
-    A state of unknown heading was linearised at a wrong one, from which the solver may not converge.
+    """Initiation of a track of a smoother, which restarts along a straight line through the first positions.
+
+    A state with an unknown heading was linearised at a wrong heading, from which the solver may not converge.
     """
 
     first_ns: int
     """Stamp of the start, at which the time of a fix is 0."""
     method: Initiation
     until_ns: int | None = None
-    """Stamp of the last fix of a line that is certain: what is newer does not change it."""
+    """Stamp of the last fix of a line that is certain; newer fixes do not change the line. None if no line is
+    certain.
+    """
 
     @classmethod
     def of(cls, motion: MotionModel, start: Start, method: str) -> "Search | None":
-        """Before the first measurement; None where no direction is sought. Raises `CallError` for another `method`."""
+        """Return the search before the first measurement; None if no direction is sought.
+
+        Raises `CallError` for an unknown `method`.
+        """
         checked = checked_initiation(method)
         return cls(start.stamp_ns, checked) if sought(motion, start, checked) else None
 
     def next_line(
         self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int
     ) -> "tuple[Line, Search] | None":
-        """The line to restart along, and another search, after measurements from the stamp `oldest_ns` on.
-        Through as many of the first `fixes` as the method asks for, whatever the order of arrival. None where the last
-        line stays, where all fixes are of one time, and where one has no uncertainty.
+        """Return the line to restart along and the following search, after new measurements from the stamp
+        `oldest_ns` on.
+
+        The line leads through the first `fixes`, as many as the method needs. It does not depend on the order
+        of arrival. None if the last line is still valid, if all fixes have the same time, or if a fix has no
+        uncertainty.
         """
         if self.until_ns is not None and oldest_ns > self.until_ns:
             return None
@@ -148,7 +162,7 @@ class Search:
 
 
 def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
-    """State (n,) of an object on `line` at `time_s`; entries that the line does not give are 0."""
+    """Return the state (n,) of an object on `line` at `time_s`. Entries that the line does not determine are 0."""
     yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
     vx_mps, vy_mps = line.velocity_mps.tolist()
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
@@ -164,12 +178,12 @@ def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
 
 
 def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:
-    """True if the direction of travel is to be sought at all: it is unknown, and `motion` has to be linearised."""
+    """True if the direction of travel must be sought: it is unknown, and `motion` must be linearised."""
     return method != "one-point" and start.yaw_rad is None and not motion.linear
 
 
 def over(line: Line, method: Initiation, certain: float) -> bool:
-    """True if `line` is the last one for `method`: its velocity is `certain` standard deviations from zero."""
+    """True if `line` is the last line of `method`: its velocity is `certain` standard deviations from zero."""
     sigmas = math.sqrt(
         line.velocity_mps @ psd_solve(line.covariance, line.velocity_mps)
     )

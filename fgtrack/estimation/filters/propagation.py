@@ -1,4 +1,4 @@
-"""Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
+"""Prediction of many objects in equal time steps, and the kinematic states that a bank publishes."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,10 @@ from fgtrack.models.motion import MotionModel, WhiteNoise
 
 
 class ExactPropagator:
-    """Predicts m objects at once, all steps in one: exact, because flow and process noise of a motion model compose."""
+    """Predicts many objects, all time steps of an object in one transition.
+
+    The result is exact, because flow and process noise of a motion model compose.
+    """
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
@@ -24,7 +27,9 @@ class ExactPropagator:
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
-        """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
+        """Return states (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`. Yaws are not
+        wrapped.
+        """
         if not (isinstance(self.motion, WhiteNoise) and self.motion.is_compiled):
             return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
         x, P = mean.copy(), covariance.copy()
@@ -34,37 +39,41 @@ class ExactPropagator:
         return x, P
 
     def wrap(self, mean: FloatArray) -> FloatArray:
-        """Means, shape (..., n), with the angles brought back to their range after a correction."""
+        """Return corrected means, shape (..., n), with the angles wrapped into their range."""
         return wrapped(self.motion, mean)
 
     def residual(
         self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray
     ) -> FloatArray:
-        """Measured minus predicted, shape (..., k), in the angles' range: the model's own."""
+        """Return measured minus predicted values, shape (..., k), with wrapped angles."""
         return model.residual(z, z_predicted)
 
 
 def track_state(
     motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray
 ) -> TrackState:
-    """A state of `motion` as it is handed out, with the yaw in (-pi, pi].
+    """Return a state of `motion` as `TrackState`, with the yaw in (-pi, pi].
 
-    Raises `CallError` for a state that is not finite, as after a prediction over a very long time.
+    Raises `CallError` for a state that is not finite, for example after a prediction over a very long time.
     """
     if not math.isfinite(mean.sum() + covariance.sum()):
         raise CallError(
-            f"stamp_ns: the state at {stamp_ns} ns is not finite, is the stamp too far from the measurements?"
+            f"stamp_ns: the state at {stamp_ns} ns is not finite, give a stamp closer to the measurements"
         )
     return TrackState(stamp_ns, wrapped(motion, mean), covariance)
 
 
 def wrapped(motion: MotionModel, mean: FloatArray) -> FloatArray:
-    """Means of `motion`, or differences of them, (..., n), with the yaw, if they have one, in (-pi, pi]."""
+    """Return means of `motion`, or differences of means, shape (..., n), with the yaw in (-pi, pi] if there is a
+    yaw.
+    """
     return mean if motion.cartesian else wrapped_yaw(mean)
 
 
 def wrapped_yaw(mean: FloatArray) -> FloatArray:
-    """Means (..., n) with the yaw in (-pi, pi]: `mean` itself where it lies there already, else a copy."""
+    """Return means (..., n) with the yaw in (-pi, pi]. If it lies there already, `mean` itself is returned, else a
+    copy.
+    """
     yaw = mean[..., YAW]
     wrapped = wrap_angles(yaw)
     if wrapped is yaw:
@@ -75,7 +84,7 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
 
 
 class States(Lazy[TrackState]):
-    """States of several objects."""
+    """Kinematic states of several objects, made at the access to an item."""
 
     def __init__(
         self, stamps_ns: Sequence[int], means: FloatArray, covariances: FloatArray
@@ -99,7 +108,10 @@ def kinematic_states(
     means: FloatArray,
     covariances: FloatArray,
 ) -> States:
-    """Published kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
+    """Return the published kinematic states of m states of `motion`, shapes (m, n) and (m, n, n).
+
+    `stamps_ns` has a stamp for each state, or one stamp for all states.
+    """
     means, covariances = motion.published(means, covariances)
     stamps_ns = [stamps_ns] * len(means) if isinstance(stamps_ns, int) else stamps_ns
     return States(stamps_ns, wrapped_yaw(means), covariances)

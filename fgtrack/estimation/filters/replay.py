@@ -25,7 +25,7 @@ from fgtrack.models.motion import MotionModel
 
 
 class Mixture(NamedTuple):
-    """A Gaussian for each of several motion models, in the state of that model, and their probabilities."""
+    """Gaussians of one object by several motion models, with the probabilities of the models."""
 
     means: tuple[FloatArray, ...]
     covariances: tuple[FloatArray, ...]
@@ -35,26 +35,27 @@ class Mixture(NamedTuple):
 
 @dataclass(slots=True)
 class Step:
-    """A measurement of a replaying filter with the state after it."""
+    """A measurement of a replaying filter, with the states before and after the measurement."""
 
     stamp_ns: int
     measurement: Measurement | None
-    """None of the oldest step, which is the prior."""
+    """None for the oldest step, which is the prior."""
     mean: FloatArray
     covariance: FloatArray
     predicted: Prediction
-    """The state before it, predicted from the step before."""
+    """The state before the measurement, predicted from the previous step."""
     search: TrackInitiation | None = None
-    """Measurements up to here, where the direction of travel was sought."""
+    """Initiation with all measurements up to this step; None if the direction of travel is not sought here."""
     mixture: Mixture | None = None
-    """States by each model of `imm-replay`; mean and covariance are their moments."""
+    """States by each model of `imm-replay`. `mean` and `covariance` are the moments of the mixture."""
 
 
 _stamp = attrgetter("stamp_ns")
 
 
 class ReplayEkf(WindowedFilter):
-    """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+    """An EKF that keeps the measurements of a window. Its estimates do not depend on the order of arrival.
+
     It rolls back and re-filters later measurements, as robot_localization does. Filters with another prediction or
     correction override `predict` and `correct`. `initiation`: see `Initiation`.
     """
@@ -75,10 +76,10 @@ class ReplayEkf(WindowedFilter):
         x, P = initial_state(motion, prior)
         search = TrackInitiation.of(motion, prior, initiation)
         self.steps = [Step(prior.stamp_ns, None, x, P, Prediction(x, P, P), search)]
-        """The steps of the window and the one that it is replayed from, by stamp and content."""
+        """The last step before the window and the steps of the window, ordered by stamp and content."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
+        """See `Estimator.state_at`: the filtered state, given the measurements up to this stamp."""
         stamp_ns = asked_stamp(stamp_ns, self.steps[0].stamp_ns)
         before = self.steps[
             max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)
@@ -87,7 +88,7 @@ class ReplayEkf(WindowedFilter):
         return track_state(self._motion, stamp_ns, mean, covariance)
 
     def _forget_before(self, stamp_ns: int) -> None:
-        # what is measured at that very stamp may still come, and belongs behind the first step
+        # a measurement at this very stamp may still come, and needs a step before it
         del self.steps[
             : max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)
         ]
@@ -133,19 +134,21 @@ class ReplayEkf(WindowedFilter):
     def predict(
         self, mean: FloatArray, covariance: FloatArray, dt_s: float
     ) -> Prediction:
-        """State `mean` (n,), `covariance` (n, n) after `dt_s` >= 0."""
+        """Return the prediction of a state, `mean` (n,) and `covariance` (n, n), after `dt_s` >= 0."""
         return predict_across(mean, covariance, self._motion, dt_s)
 
     def correct(
         self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
     ) -> OneCorrection:
-        """State after `measurement` at the stamp of `mean` (n,) and `covariance` (n, n), with the innovation before it.
-        Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
+        """Return the correction of a state, `mean` (n,) and `covariance` (n, n), by a measurement at the same
+        stamp.
+
+        Raises `numpy.linalg.LinAlgError` if the measurement cannot be fused.
         """
         return correct_one(mean, covariance, measurement)
 
     def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
-        """State at `stamp_ns`, predicted from a step."""
+        """Return the state at `stamp_ns`, predicted from the step `before`."""
         if stamp_ns == before.stamp_ns:
             return Prediction(before.mean, before.covariance, before.covariance)
         return self.predict(
@@ -155,7 +158,7 @@ class ReplayEkf(WindowedFilter):
     def _step(
         self, before: Step, measurement: Measurement
     ) -> tuple[Step, OneCorrection]:
-        """The step of `measurement` after the step before it. Raises as `correct`."""
+        """Return the step of `measurement` after the step `before`, and its correction. Raises as `correct`."""
         predicted = self._ahead(before, measurement.stamp_ns)
         corrected = self.correct(predicted.mean, predicted.covariance, measurement)
         return self._concluded(before, measurement, predicted, corrected), corrected
@@ -167,7 +170,9 @@ class ReplayEkf(WindowedFilter):
         predicted: Prediction,
         corrected: OneCorrection,
     ) -> Step:
-        """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
+        """Return the step of a corrected state. While the direction of travel is sought, the state comes from
+        the line instead.
+        """
         mean, covariance = corrected.mean, corrected.covariance
         search = (
             None
@@ -188,7 +193,10 @@ class ReplayEkf(WindowedFilter):
     def _retrodicted(
         self, new: Step, later: Sequence[Step]
     ) -> tuple[FloatArray, FloatArray]:
-        """State (n,), (n, n) at the `new` measurement, given all that was fused before, the `later` steps included."""
+        """Return the state, (n,) and (n, n), at the `new` measurement, given all other measurements.
+
+        `later` are the steps after the new measurement.
+        """
         links: list[Link] = [
             (each.stamp_ns, each.mean, each.covariance, each.predicted)
             for each in later

@@ -48,7 +48,7 @@ from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.robust import compiled_form
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
-#: In the order of the numbers that the kernels give.
+#: Statuses by the number of the outcome in the compiled loops.
 _STATUS = (
     UpdateStatus.FAILED,
     UpdateStatus.TOO_OLD,
@@ -63,12 +63,12 @@ Stack = tuple[IntArray, FloatArray, int, FloatArray, FloatArray]
 
 
 class Outside(NamedTuple):
-    """A step that compiled loops cannot take alone."""
+    """A step that compiled loops cannot replay alone."""
 
     measurement: Measurement | None
-    """None of the first step, which is the prior."""
+    """None for the first step, which is the prior."""
     search: TrackInitiation | None
-    """Measurements up to here, while the direction of travel is sought."""
+    """Initiation with all measurements up to this step; None if the direction of travel is known."""
 
     @property
     def is_plugin(self) -> bool:
@@ -80,10 +80,10 @@ _INSIDE = Outside(None, None)
 
 
 class ReplayBank(Stateful):
-    """The replaying EKFs of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
+    """The replaying EKFs of all objects. Their steps lie in arrays: a compiled loop replays all tracks of a list.
 
-    A track leaves the loop, and is replayed step by step, while its window has a step at which the direction of travel
-    was sought, or a measurement that a plug-in models. See `fgtrack.estimation.kernels.replay`.
+    A track is replayed step by step, outside this loop, in two cases: its window has a step at which the direction
+    of travel was sought, or a measurement that a plug-in models. See `fgtrack.estimation.kernels.replay`.
 
     Parameters
     ----------
@@ -114,12 +114,14 @@ class ReplayBank(Stateful):
         self._kind, self._noise = motion.kind, motion.noise
         self.present_ns = 0
         """See `TrackBank.present_ns`."""
-        self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
+        self._start_ns = -int(LARGEST_NS)  # oldest stamp that the clock allows
         self._rows: dict[int, int] = {}
         """Row of the arrays that holds each track, by track id in order of birth."""
-        self._order: IntArray | None = None  # these rows, until a track comes or goes
+        self._order: IntArray | None = (
+            None  # the same rows as an array; None after a birth or removal
+        )
         self._outside: dict[int, dict[int, Outside]] = {}
-        """Steps that compiled loops cannot take alone, by row and slot."""
+        """Steps that compiled loops cannot replay alone, by row and slot."""
         self._free: list[int] = []
         self._arrays: tuple[Any, ...] = ()
         self._shape: tuple[int, ...] = 0, 0, 0  # numbers of tracks, steps, components
@@ -153,7 +155,7 @@ class ReplayBank(Stateful):
         if self._arrays:
             order, labels, steps, windows, measured, views = self._arrays
             track, place = np.nonzero(np.arange(order.shape[1]) < windows[:, :1])
-            used = track, order[track, place]  # only the pages of used slots are made
+            used = track, order[track, place]  # memory is used by these slots only
             arrays[0][:present, : order.shape[1]], arrays[3][:present] = order, windows
             arrays[1][*used, : labels.shape[2]], arrays[2][used] = (
                 labels[used],
@@ -180,14 +182,14 @@ class ReplayBank(Stateful):
         )
 
     def states_of(self, stamp_ns: int, track_id: int) -> StatesAt:
-        """Return `states_at` of one track, at a cost that does not depend on the number of the others."""
+        """Return the state of one track at `stamp_ns`, at a cost that does not depend on the number of tracks."""
         if track_id not in self._rows:
             return no_states(self._motion.dim)
         count, _, *states = self._ahead(np.array([self._rows[track_id]]), stamp_ns)
         return StatesAt((track_id,), *states) if count else no_states(self._motion.dim)
 
     def present(self) -> Sequence[TrackState]:
-        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
+        """See `TrackBank.present`. An object whose first stamp is after the present has its first state."""
         return kinematic_states(
             self._motion,
             self.present_ns,
@@ -212,7 +214,7 @@ class ReplayBank(Stateful):
     def _update(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
-        """Return the outcomes of a stack of measurements."""
+        """Return the results of a stack of measurements, one for each of `track_ids`."""
         try:
             seen = one.seen_by(self._motion)
             is_plugin = not seen.model.is_compiled
@@ -263,7 +265,7 @@ class ReplayBank(Stateful):
         self._order = None
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`: none."""
+        """See `TrackBank.smoothed`: always empty."""
         return []
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
@@ -286,7 +288,7 @@ class ReplayBank(Stateful):
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
-        """Outcomes of a stack of measurements of entries of the state."""
+        """Fuse a stack of measurements in the compiled loop, and return the results."""
         try:
             rows = np.array(list(map(self._rows.__getitem__, track_ids)))
             m, k = one.z.shape
@@ -323,7 +325,7 @@ class ReplayBank(Stateful):
     def _fused_in_more_room(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
-        """Return `_fused` of tracks whose slots are all in use, after the slots have doubled."""
+        """Double the slots of all tracks, then return `_fused`: all slots of these tracks are in use."""
         with changing_nothing(track_ids):
             self._allocate(0, 2 * self._shape[1], 0)
         return self._fused(stamp_ns, track_ids, one)
@@ -331,7 +333,11 @@ class ReplayBank(Stateful):
     def _states(
         self, stamp_ns: int, is_present: bool = False
     ) -> tuple[BoolArray | None, FloatArray, FloatArray]:
-        """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
+        """Return a mask (m,) of the tracks with a state at `stamp_ns`, means (m, n) and covariances (m, n, n)
+        of all tracks.
+
+        The mask is None if all tracks have a state.
+        """
         if self._order is None:
             self._order = np.array([*self._rows.values()], dtype=np.int64)
         count, known, means, covariances = self._ahead(
@@ -342,7 +348,9 @@ class ReplayBank(Stateful):
     def _ahead(
         self, rows: IntArray, stamp_ns: int, is_present: bool = False
     ) -> tuple[int, BoolArray, FloatArray, FloatArray]:
-        """Return `kernels.replay.ahead` of rows of the arrays: how many and which are known, means and covariances."""
+        """Return the states of the tracks in `rows` at `stamp_ns`: their number, a mask of the tracks with a
+        state, means and covariances. See `fgtrack.estimation.kernels.replay.ahead`.
+        """
         m, n = len(rows), self._motion.dim
         known, means, covariances = (
             np.empty(m, dtype=bool),
@@ -358,7 +366,7 @@ class ReplayBank(Stateful):
     # --- tracks outside the compiled loop, step by step
 
     def _fused_outside(self, track_id: int, one: Measurement) -> list[UpdateResult]:
-        """Return the outcome of a measurement of a track that is replayed step by step.
+        """Fuse a measurement into a track that is replayed step by step, and return the result.
 
         An exception changes nothing.
         """
@@ -386,9 +394,11 @@ class ReplayBank(Stateful):
     def _replayed(
         self, row: int, one: Measurement, steps: dict[int, Outside]
     ) -> UpdateResult | None:
-        """Put a measurement into the steps of a track, and re-filter the later ones; None where all slots are in use.
+        """Insert a measurement into the steps of a track and re-filter the later measurements. None if all
+        slots are in use.
 
-        `steps` are those of `_outside`. Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
+        `steps` are the steps of this track in `_outside`. Raises `numpy.linalg.LinAlgError` if a measurement
+        cannot be fused.
         """
         order, _, _, windows, _, _ = self._arrays
         times_ns = self._lag_ns, self._start_ns, one.stamp_ns
@@ -410,8 +420,10 @@ class ReplayBank(Stateful):
         return UpdateResult(status, y, nis, S)
 
     def _replay_step(self, row: int, index: int, steps: dict[int, Outside]) -> None:
-        """Predict a step and fuse its measurement; while the direction is sought, the state is that along the line.
-        Raises `numpy.linalg.LinAlgError` where that is impossible.
+        """Predict a step and fuse its measurement. While the direction is sought, the state comes from the line
+        instead.
+
+        Raises `numpy.linalg.LinAlgError` if the measurement cannot be fused.
         """
         n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
         before, slot = order[row, index - 1 : index + 1].tolist()
@@ -448,8 +460,10 @@ class ReplayBank(Stateful):
         one: Measurement,
         steps: dict[int, Outside],
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Innovation y (k,), its covariance S (k, k) and NIS of the new step at `index`, given all other steps.
-        Raises `numpy.linalg.LinAlgError` where S has no root.
+        """Return innovation y (k,), its covariance S (k, k) and NIS of the new step at `index`, given all other
+        steps.
+
+        Raises `numpy.linalg.LinAlgError` if S is not positive definite.
         """
         n = self._motion.dim
         now = self._retrodicted_along_line(row, index, last, one.stamp_ns, steps)
@@ -480,7 +494,9 @@ class ReplayBank(Stateful):
         stamp_ns: int,
         steps: dict[int, Outside],
     ) -> FloatArray | None:
-        """State at a stamp given all later steps, (n + 1, n), where a later step lies along a line; else None."""
+        """Return the state (n + 1, n) at a stamp given all later steps, if a later step lies along a line; else
+        None.
+        """
         n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
         links = list[Link]()
         for slot in reversed(order[row, index + 1 : last + 1].tolist()):
@@ -496,7 +512,7 @@ class ReplayBank(Stateful):
         return None
 
     def _keep_outside(self, row: int, steps: dict[int, Outside]) -> None:
-        """Keep `steps` of a track as far as its window needs them; without any, the compiled loop replays the track."""
+        """Keep the `steps` of a track that its window needs. If none is left, the compiled loop replays the track."""
         order, labels, _, windows, _, _ = self._arrays
         slots = order[row, : windows[row, 0]]
         oldest_ns = max(int(windows[row, 1]), self._start_ns)
@@ -523,7 +539,9 @@ def _stack(one: Measurement) -> Stack:
 def _results(
     y: FloatArray, S: FloatArray, nis: FloatArray, status: IntArray
 ) -> list[UpdateResult]:
-    """Return the outcomes of innovations (m, k), covariances (m, k, k), NIS and status as the kernels write them."""
+    """Return the results of innovations (m, k), covariances (m, k, k), NIS (m,) and outcomes (m,) of the compiled
+    loop.
+    """
     statuses = list(map(_STATUS.__getitem__, status.tolist()))
     results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
     if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
@@ -537,10 +555,11 @@ def _results(
 def ekf_replay(
     motion: MotionModel, lag_s: float, initiation: str = DEFAULT
 ) -> TrackBank:
-    """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+    """Return the bank of EKFs with replay, whose estimates do not depend on the order of arrival.
 
-    It rolls back and re-filters later measurements, as robot_localization does. The motion model of a plug-in is
-    linearised outside the compiled loops, with a `ReplayEkf` for each object. `initiation`: see `Initiation`.
+    The filters keep the measurements of a window. They roll back and re-filter later measurements, as
+    robot_localization does. A motion model of a plug-in is linearised outside the compiled loops, with a
+    `ReplayEkf` for each object. `initiation`: see `Initiation`.
     """
     if isinstance(motion, WhiteNoise) and motion.is_compiled:
         return ReplayBank(motion, lag_s, initiation)

@@ -1,4 +1,4 @@
-"""The first measurements of an object that starts with an unknown direction of travel, in filters."""
+"""The first measurements of an object with an unknown direction of travel, in filters."""
 
 import bisect
 import math
@@ -37,31 +37,34 @@ from fgtrack.estimation.filters.initiation import (
 from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.motion import MotionModel
 
-#: What a filter linearises in this direction stays good.
+#: A direction is certain at this number of standard deviations: a filter may linearise in this direction.
 CERTAIN = 1.0 / KNOWN_YAW_STD_RAD
-#: After this time, and after so many measurements, a filter does not seek the direction any more: the object may be at
-#: rest, and each further measurement costs as much as all before it.
+#: After this time, or this number of measurements, a filter no longer seeks the direction. The object may be at rest,
+#: and each further measurement costs as much as all measurements before it.
 LONGEST_S, MOST_MEASUREMENTS = 2.0, 25
 
 
 @dataclass(frozen=True)
 class TrackInitiation:
-    """Measurements of a new object while its direction of travel is sought, in order of the stamps; immutable."""
+    """Measurements of a new object, ordered by stamp, while its direction of travel is sought. Immutable."""
 
     motion: MotionModel
     start: Start
     method: Initiation
     measurements: tuple[Measurement, ...] = ()
     fixes: tuple[Fix, ...] = ()
-    """With that of the start."""
+    """Measured positions; the first one is the position of the start."""
     line: Line | None = None
-    """Through the fixes; None where they are of one time."""
+    """Line through the fixes; None if all fixes have the same time."""
 
     @classmethod
     def of(
         cls, motion: MotionModel, start: Start, method: str
     ) -> "TrackInitiation | None":
-        """Before the first measurement; None where no direction is sought. Raises `CallError` for another `method`."""
+        """Return the initiation before the first measurement; None if no direction is sought.
+
+        Raises `CallError` for an unknown `method`.
+        """
         checked = checked_initiation(method)
         if not sought(motion, start, checked):
             return None
@@ -69,7 +72,7 @@ class TrackInitiation:
         return cls(motion, start, checked, fixes=(Fix(0.0, x[:2], P[:2, :2]),))
 
     def with_measurement(self, measurement: Measurement) -> "TrackInitiation | None":
-        """With one more measurement, the newest; None where the direction is known, or sought no more."""
+        """Return the initiation with one more measurement, the newest; None if the direction is no longer sought."""
         time_s = seconds(measurement.stamp_ns - self.start.stamp_ns)
         if (
             self.over
@@ -83,9 +86,7 @@ class TrackInitiation:
         if fix is not None and time_s > 0.0:
             try:
                 [line] = straight_lines(fixes, len(fixes))
-            except (
-                np.linalg.LinAlgError
-            ):  # of a position that is known without error, no line can be weighted
+            except np.linalg.LinAlgError:  # a position without error has no weight
                 line = None
         return replace(
             self, measurements=(*self.measurements, measurement), fixes=fixes, line=line
@@ -93,19 +94,21 @@ class TrackInitiation:
 
     @property
     def over(self) -> bool:
-        """True if the direction is known: what comes next is fused by the filter itself."""
+        """True if the direction is known. The filter itself then fuses all further measurements."""
         return self.line is not None and over(self.line, self.method, CERTAIN)
 
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) and covariance (n, n) after the newest measurement: all of them filtered along the line.
+        """Return mean (n,) and covariance (n, n) after the newest measurement, filtered along the line.
 
-        A Kalman filter linearised at a nominal trajectory that starts on the line, instead of at its own estimates
-        (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 10.3):
+        A Kalman filter is linearised at a nominal trajectory that starts on the line, instead of at its own
+        estimates (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
+        2001, section 10.3):
 
             x' = f(x_n) + F (x - x_n),   P' = F P F' + Q,   F = df/dx at x_n
 
-        Each measurement counts once: the line gives only the trajectory and the direction, with the wide standard
-        deviation of `start`. Raises `numpy.linalg.LinAlgError` where the state is not finite, and without a line.
+        Each measurement counts once: the line gives only the trajectory and the direction, with the wide
+        standard deviation of `start`. Raises `numpy.linalg.LinAlgError` if the state is not finite, and if
+        there is no line.
         """
         _, mean, covariance, _ = self._filtered()[-1]
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
@@ -113,9 +116,10 @@ class TrackInitiation:
         return mean, covariance
 
     def turned(self) -> Start:
-        """The start, turned along the line and as fast, but as uncertain as before: the measurements count from there.
-        The speed counts a little more than once where line and start are about equally certain of it. Raises as
-        `state`.
+        """Return the start with the direction and the speed of the line, and with its own uncertainty.
+
+        The measurements are fused from this start. The speed counts a little more than once if the line and the
+        start are about equally certain of the speed. Raises as `state`.
         """
         yaw_rad, speed_mps = self._course()
         std_rad = (
@@ -130,14 +134,19 @@ class TrackInitiation:
     def retrodicted(
         self, stamp_ns: int, mean: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The state at `stamp_ns` given all measurements, of `mean` (n,) and `covariance` (n, n) at the newest one."""
+        """Return the state at `stamp_ns` given all measurements.
+
+        `mean` (n,) and `covariance` (n, n) are the smoothed state at the newest measurement.
+        """
         links = [
             link for link in self._filtered((stamp_ns, None)) if link[0] >= stamp_ns
         ]
         return smoothed_back(self.motion, links, mean, covariance)
 
     def _filtered(self, *others: tuple[int, None]) -> list[Link]:
-        """The start, and the state after each measurement and at the stamps of `others`."""
+        """Return the states at the start, after each measurement, and at the stamps of `others`, in order of
+        the stamps.
+        """
         x, P = initial_state(self.motion, self.start)
         nominal = self.nominal(x)
         if not self.motion.cartesian:
@@ -161,7 +170,11 @@ class TrackInitiation:
         return links
 
     def nominal(self, x: FloatArray) -> FloatArray:
-        """State (n,) on the line at the start, other entries as in x (n,); raises as `state` without a line."""
+        """Return the state (n,) on the line at the start. Entries that the line does not determine are taken
+        from x (n,).
+
+        Raises as `state` without a line.
+        """
         yaw_rad, speed_mps = self._course()
         motion = (
             cartesian(np.array([yaw_rad, speed_mps]))
@@ -175,7 +188,11 @@ class TrackInitiation:
         return nominal
 
     def _course(self) -> tuple[float, float]:
-        """Direction of the line, and the speed along it, weighted with that of the start: a short line may be off."""
+        """Return the direction of the line, and the speed: a weighted mean of the speeds of the line and the
+        start.
+
+        A short line may have a wrong speed.
+        """
         if self.line is None:
             raise np.linalg.LinAlgError("no line leads through the first positions")
         yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
@@ -189,15 +206,20 @@ class TrackInitiation:
 def initiated(
     motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]
 ) -> Estimator:
-    """Return what `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
+    """Return the estimator that `make` gives for `start`, wrapped in `Initiated` if its direction of travel is
+    sought.
+
+    Raises `CallError` for an unknown `method`.
+    """
     search = TrackInitiation.of(motion, start, method)
     return make(start) if search is None else Initiated(search, make)
 
 
 class Initiated(Stateful):
-    """An `Estimator` that is reinitialised along the first positions until their direction is certain.
-    A new one that starts along the line (see `TrackInitiation.turned`) fuses all measurements so far, in order of
-    stamps.
+    """Wrapper that restarts an `Estimator` along its first positions until their direction is certain.
+
+    The new estimator starts along the line, see `TrackInitiation.turned`. It fuses all measurements so far in the
+    order of their stamps.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -227,7 +249,7 @@ class Initiated(Stateful):
         return self._inner.window_ns
 
     def update(self, measurement: Measurement) -> UpdateResult:
-        """See `Estimator.update`; the innovation is that before it is reinitialised."""
+        """See `Estimator.update`. The innovation is that of the estimator before the restart."""
         result = self._inner.update(measurement)
         if self._search is not None and result.innovation is not None:
             bisect.insort(
@@ -251,7 +273,7 @@ class Initiated(Stateful):
         return repr(self._inner)
 
     def _begin_again(self, search: TrackInitiation) -> None:
-        """Let a new estimator that starts along the first positions replace the present one, if it can."""
+        """Replace the estimator by a new one that starts along the first positions, if that is possible."""
         count = 0
         for measurement in self._fused:
             longer = search.with_measurement(measurement)

@@ -76,7 +76,7 @@ def regression(
 
 
 class DenseRule(NamedTuple):
-    """Points of a Gaussian with weights: many in the directions in which angles are uncertain."""
+    """Weighted points of a Gaussian, dense in the directions in which angles are uncertain."""
 
     points: FloatArray
     """Shape (m, n)."""
@@ -109,8 +109,8 @@ class DenseRule(NamedTuple):
         2007).
         """
         n, root, gradients = len(mean), _root(covariance), np.vstack([sights, turns])
-        # Directions on which the angles depend come first, the others leave them alone: few directions are wide, and a
-        # turned world has turned points.
+        # Directions on which the angles depend come first. The angles do not depend on the other directions. So few
+        # directions are wide, and a turned world has turned points.
         root = (
             root
             @ np.linalg.qr(
@@ -151,9 +151,10 @@ class DenseRule(NamedTuple):
     def regression(
         self, values: FloatArray, centre: FloatArray, circular: Sequence[int] = ()
     ) -> Regression:
-        """Return the regression of `values` (m, k) of a function at the points; `centre` (k,) is near its mean.
+        """Return the regression of the `values` (m, k) of a function at the points; `centre` (k,) is near its
+        mean.
 
-        The `circular` components are angles: their mean is the one from which the wrapped differences cancel.
+        `circular` components are angles. Their mean is the angle at which the wrapped differences sum to zero.
         """
         mean, apart = centre, values - centre
         for _ in range(_MOST_STEPS):
@@ -198,7 +199,9 @@ def _root(covariance: FloatArray) -> FloatArray:
 def measurement_regression(
     measurement: Measurement, mean: FloatArray, covariance: FloatArray
 ) -> Regression:
-    """Regression of the measurement model; angles that are no entries of the state are averaged on the circle."""
+    """Return the regression of the measurement model. Angles that are not entries of the state are averaged on the
+    circle.
+    """
     model, pose = measurement.model, measurement.pose
     rule = _rule_of(measurement, mean, covariance)
     if rule is None:
@@ -216,7 +219,7 @@ def measurement_regression(
 def _rule_of(
     measurement: Measurement, mean: FloatArray, covariance: FloatArray
 ) -> DenseRule | None:
-    """Return the dense rule for a measurement, where its line of sight or a heading in it is uncertain."""
+    """Return the dense rule for a measurement if its line of sight or a heading in it is uncertain, else None."""
     model, n = measurement.model, len(mean)
     turns, sights = np.zeros((1, n)), np.zeros((4, n))
     is_cartesian = "yaw_rad" not in model.state_names
@@ -236,7 +239,7 @@ def _rule_of(
 def _difference(
     model: MeasurementModel,
 ) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Function of the difference of two measurements; angles that are no entries of the state are wrapped."""
+    """Return the function that subtracts two measurements. Angles that are not entries of the state are wrapped."""
     direct = np.array(
         [k for k, name in enumerate(model.components) if name in model.state_names],
         dtype=np.int64,
@@ -286,7 +289,9 @@ class UkfReplay(ReplayEkf):
     def _turning_rule(
         self, mean: FloatArray, covariance: FloatArray, dt_s: float
     ) -> DenseRule | None:
-        """Return the dense rule for a prediction, where the yaw before or after it is uncertain."""
+        """Return the dense rule for a prediction if the yaw before or after the prediction is uncertain, else
+        None.
+        """
         names = self._motion.state_names[: len(mean)]
         if "yaw_rad" not in names:
             return None

@@ -20,10 +20,10 @@ from fgtrack.models.motion import MotionModel
 
 
 class WindowedFilter(Stateful, ABC):
-    """An `Estimator` that refuses measurements older than its window and fuses all others by `_fuse`.
+    """Base of an `Estimator` that refuses measurements older than its window and fuses all others by `_fuse`.
 
-    The window reaches `lag_s` behind the newest stamp or the clock, and not beyond the stamp of the `prior`. Process
-    noise of a motion model composes, so a late measurement may split a stretch of time.
+    The window reaches `lag_s` behind the newest stamp or the clock, but not behind the stamp of the `prior`. The
+    process noise of a motion model composes, so a late measurement may split an interval.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -61,7 +61,7 @@ class WindowedFilter(Stateful, ABC):
         )
 
     def moved_on(self, stamp_ns: int) -> UpdateStatus:
-        """Status of a fused measurement; the window moves to the stamp of the measurement."""
+        """Return the status of a fused measurement, and move the window to its stamp if it is the newest."""
         if stamp_ns < self._newest_ns:
             return UpdateStatus.OUT_OF_SEQUENCE
         self._newest_ns = stamp_ns
@@ -73,9 +73,9 @@ class WindowedFilter(Stateful, ABC):
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:
-        """Fuse a measurement of the window; None where the method ignores the measurement.
+        """Fuse a measurement inside the window. Return None if the method ignores the measurement.
 
-        Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused; the state is then unchanged.
+        Raises `numpy.linalg.LinAlgError` if the measurement cannot be fused; the state is then unchanged.
         """
 
     @abstractmethod

@@ -67,7 +67,9 @@ _VECTORS, _MATRICES, _READ = (
 def marginal_nis(
     S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray
 ) -> float:
-    """Return the NIS of the `rows` of y (k,) with covariance S; NaN where that of the rows has no root."""
+    """Return the NIS of the `rows` of y (k,) with covariance S; NaN if the covariance of these rows is not positive
+    definite.
+    """
     for a in range(len(rows)):
         white[a] = y[rows[a]]
         for b in range(a + 1):
@@ -88,7 +90,10 @@ def conclude(
     AP: FloatArray,
     KR: FloatArray,
 ) -> bool:
-    """Overwrite mean and P by x + K y and A P A' + K R K', A = I - K H, of K transposed; True if all is finite."""
+    """Overwrite mean and P by x + K y and A P A' + K R K' with A = I - K H. True if all values are finite.
+
+    `K` is the transposed gain, shape (k, n).
+    """
     total, n = 0.0, len(mean)
     product(A, P, AP)
     for a in range(n):
@@ -120,8 +125,9 @@ def smooth_state(
 ) -> bool:
     """Overwrite a state by x + C s and P + C (P_s - P_-) C', see `fgtrack.estimation.rts.rts_step`.
 
-    The next state has the prediction P_-, the shift s by its smoothing, and then the covariance P_s = `after`. `gain`
-    holds the cross-covariance C P_-, transposed, and then C'. False where P_- has no root.
+    The next state has the predicted covariance P_-. Smoothing has moved its mean by the shift s, and its covariance
+    to P_s = `after`. On entry `gain` holds the transposed cross-covariance C P_-, afterwards C'. False if P_- is
+    not positive definite.
     """
     n = len(mean)
     copy(predicted, root)
@@ -144,7 +150,7 @@ def smooth_states(
     shifts: FloatArray,
     after: FloatArray,
 ) -> bool:
-    """`smooth_state` of states (m, n) and (m, n, n); False where a prediction has no root."""
+    """Apply `smooth_state` to states (m, n) and (m, n, n). False if a predicted covariance is not positive definite."""
     (m, n), is_regular = means.shape, True
     check(shifts.shape == (m, n) and P.shape == (m, n, n))
     check(predicted.shape == P.shape and gains.shape == P.shape)
@@ -168,11 +174,12 @@ def robust_weight(
     root: FloatArray,
     column: FloatArray,
 ) -> float:
-    """Return the weight w of an innovation y (k,) with covariance `spread` + R under a robust loss, NaN without a root.
+    """Return the weight w of an innovation y (k,) with covariance `spread` + R under a robust loss; NaN if that is
+    singular.
 
-    At w the correction with R / w minimises prior plus loss of the post-fit residual r = R / w S^-1 y, S = `spread` + R
-    / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 never lets w grow, so it ends at the
-    largest of these weights.
+    The correction with R / w minimises prior cost plus robust loss of the post-fit residual r = R / w S^-1 y, with
+    S = `spread` + R / w. The weight w is the weight of the loss at sqrt(r' R^-1 r). Reweighting starts at w = 1 and
+    never increases w, so it ends at the largest of these weights.
     """
     k, w = len(y), 1.0
     for _ in range(_MAX_REWEIGHTINGS):
@@ -198,7 +205,7 @@ def robust_weight(
 def robust_weight_of(
     spread: FloatArray, R: FloatArray, y: FloatArray, loss: int, width: float
 ) -> float:
-    """See `robust_weight`."""
+    """Return `robust_weight`, for callers outside compiled loops."""
     k = len(y)
     check(spread.shape == (k, k) and R.shape == (k, k))
     root, column = scratch(k, k), scratch(k, 1)
@@ -220,8 +227,8 @@ def correct_state(
 ) -> float:
     """Overwrite mean and P by x + K y and (I - K H) P (I - K H)' + K R K' with K = P H' S^-1, S = H P H' + R.
 
-    Innovation y (k,), Jacobian H (k, n), first k rows and columns of R, divided by the weight under the loss. Returns
-    the weight; NaN where S is not positive definite or the result not finite.
+    The innovation is y (k,), with the Jacobian H (k, n). R has at least k rows and columns. It is divided by the
+    weight under the loss. Returns the weight; NaN if S is not positive definite or the result is not finite.
     """
     k, n, w = len(y), len(mean), 1.0
     A, AP, K, KR, root, spread, noise, column = space
@@ -257,8 +264,11 @@ def innovations(
     R: FloatArray,
     rows: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return S = H P H' + R (m, k, k) of innovations y (m, k), and of their `rows` the NIS and log det S, shapes (m,).
-    NaN where S has no root. Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
+    """Return the covariances S = H P H' + R (m, k, k) of innovations y (m, k), and NIS and log det S of their
+    `rows`, (m,).
+
+    Jacobians H are (m, k, n) or (1, k, n), covariances P (tracks, n, n) and R (m, k, k). The NIS is NaN if S is not
+    positive definite.
     """
     m, k = y.shape
     check_rows(tracks, 0, len(P))
@@ -298,7 +308,7 @@ def propagate(
     steps: IntArray,
     dt_s: float,
 ) -> None:
-    """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
+    """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`, to f(x) and F P F' + Q."""
     n = mean.shape[1]
     check(
         len(P) >= len(mean)
@@ -335,8 +345,8 @@ def correct(
 ) -> None:
     """Fuse innovations y (m, k) into means (m, n) and covariances (m, n, n), see `correct_state`.
 
-    Jacobians H are (1, k, n) or (m, k, n), covariances R (m, k, k). Writes S = H P H' + R, the NIS of the `rows` of y,
-    and the weight under the loss, NaN where nothing was fused.
+    Jacobians H are (1, k, n) or (m, k, n), covariances R (m, k, k). Writes S = H P H' + R, the NIS of the `rows` of
+    y, and the weight under the loss, which is NaN if the innovation was not fused.
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
     check_rows(rows, 0, k)

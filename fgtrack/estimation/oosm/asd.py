@@ -17,7 +17,9 @@ from fgtrack.estimation.rts import between
 from fgtrack.models.motion import MotionModel
 
 _Stack = tuple[tuple[int, ...], FloatArray, FloatArray]
-"""N stamps, oldest first, and mean (N n,) and covariance (N n, N n) of their states. Yaws are not wrapped."""
+"""N stamps, oldest first, with mean (N n,) and covariance (N n, N n) of the states at these stamps. Yaws are not
+wrapped.
+"""
 
 
 class AccumulatedStateDensity(WindowedFilter):
@@ -42,14 +44,14 @@ class AccumulatedStateDensity(WindowedFilter):
     nonlinear = "never"
     smooths = True
     tolerance = 1e-7
-    """Splitting the state between two close neighbours off a joint covariance costs digits."""
+    """Inserting a state between two close neighbours loses digits of the joint covariance."""
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         super().__init__(motion, prior, lag_s)
         self._stack: _Stack = ((prior.stamp_ns,), *initial_state(motion, prior))
 
     def state_at(self, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: smoothed, from all measurements."""
+        """See `Estimator.state_at`: the smoothed state, given all measurements."""
         stamp_ns = asked_stamp(stamp_ns, self._stack[0][0])
         (_, mean, covariance), block = self._with_state(stamp_ns)
         return track_state(
@@ -71,7 +73,7 @@ class AccumulatedStateDensity(WindowedFilter):
         return result
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
-        """The stack with a state at `stamp_ns`, and its slice of the stack."""
+        """Return the stack with a state at `stamp_ns`, and the slice of this state in the stack."""
         n, (stamps_ns, mean, covariance) = self._motion.dim, self._stack
         index = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
         if stamps_ns[index] == stamp_ns:

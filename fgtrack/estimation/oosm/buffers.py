@@ -1,4 +1,4 @@
-"""Hold measurements back until the late ones have come, as in industry."""
+"""Methods that hold measurements back until the late measurements have come, as in industry."""
 
 from typing import ClassVar
 

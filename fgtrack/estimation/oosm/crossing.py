@@ -19,18 +19,19 @@ from fgtrack.estimation.oosm.late import FilterStep, RewindForget
 from fgtrack.estimation.rts import rts_step
 
 Past = tuple[FloatArray, FloatArray, FloatArray]
-"""Mean x_tau (n,) and covariance P_tau (n, n) by a method at the stamp tau of a late measurement, and the covariance
-(m, n) of the state to be corrected with the state at tau."""
+"""Mean x_tau (n,) and covariance P_tau (n, n) of the estimate at the stamp tau of a late measurement, and the
+covariance (m, n) of the present state with the state at tau.
+"""
 
 
 def fuse_across(
     mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement
 ) -> OneCorrection:
-    """State x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
+    """Return the state x, `mean` (m,) and `covariance` (m, m), after a measurement of the `past` state.
 
-    S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
-    2002, see `A1`). A robust loss divides R by its weight (see `robust_weight`). Raises `numpy.linalg.LinAlgError`
-    where S is not positive definite or the result is not finite.
+    S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau)
+    (Bar-Shalom 2002, see `A1`). A robust loss divides R by its weight (see `robust_weight`). Raises
+    `numpy.linalg.LinAlgError` if S is not positive definite or the result is not finite.
     """
     x_tau, P_tau, cross = past
     y, H = measurement.model.linearised(measurement.z, x_tau, measurement.pose)
@@ -63,7 +64,7 @@ class CrossingEkf(RewindForget):
         result = fuse_across(now.mean, now.covariance, past, measurement)
         np.linalg.cholesky(
             result.covariance
-        )  # an approximate cross-covariance may take away more than there is
+        )  # with an approximate cross-covariance, P+ may be indefinite
         self._absorb(result.mean, result.covariance)
         return result
 
@@ -100,13 +101,15 @@ class A1(CrossingEkf):
     then `fuse_across`. At l lags the same equations are used with the whole noise Q(k, tau) and the last innovation
     alone.
 
-    Exact for: one lag, the first late measurement since the newest stamp. At several lags it takes away more covariance
-    than there is, the more so the larger Q is; where none would be left the measurement is `failed`.
+    Exact for: one lag, the first late measurement since the newest stamp. At several lags it subtracts too much
+    covariance, and more for a larger Q. A measurement that would leave no covariance is `failed`.
     """
 
     exact = "one lag, first late measurement"
     noise_in_state, equivalent = True, False
-    """False: v is not estimated. True: by the measurements of all steps since m, not of the newest stamp alone."""
+    """`noise_in_state` False: v is not estimated. `equivalent` True: v is estimated from all steps since m, not
+    from the newest measurement alone.
+    """
 
     def _past(self, stamp_ns: int) -> Past:
         now, motion = self._steps[-1], self._motion
@@ -260,12 +263,12 @@ class Larsen(CrossingEkf):
     """Correct the present with the innovation against the old prediction, carried through the gains since.
 
     Larsen, Andersen, Ravn and Poulsen, Incorporation of time delayed measurements in a discrete-time Kalman filter,
-    IEEE Conference on Decision and Control, 1998; like Alexander, SPIE 1991. With M the product of (I - K_j H_j) F_j
-    over the steps since tau and K_tau the gain at tau:
+    IEEE Conference on Decision and Control, 1998; like Alexander, SPIE 1991. M is the product of (I - K_j H_j) F_j
+    over the steps since tau, and K_tau is the gain at tau:
 
         x+ = x_k + M K_tau (z - h(x_{tau|m})),   P+ = P_k - M K_tau H P_{tau|m} M'
 
-    that is `fuse_across` with x_{tau|m}, P_{tau|m} and P_k,tau = M P_{tau|m}, with the gains that were used.
+    This is `fuse_across` with x_{tau|m}, P_{tau|m} and P_k,tau = M P_{tau|m}, with the gains that were used.
 
     Exact for: nothing. Consistent and suboptimal: measurements since tau do not sharpen the innovation.
     """

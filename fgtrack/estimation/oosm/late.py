@@ -1,4 +1,4 @@
-"""EKFs in sequence: late measurements are ignored, taken as current, rolled back to, or predicted forward and fused."""
+"""EKFs that treat a late measurement in one step: ignore it, take it as current, roll back, or predict it forward."""
 
 import bisect
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _Estimate = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class FilterStep:
-    """A state before and after a measurement, and its information; yaws are not wrapped."""
+    """A state before and after a measurement, and the information of the measurement. Yaws are not wrapped."""
 
     stamp_ns: int
     mean: FloatArray
@@ -43,7 +43,7 @@ class FilterStep:
     score: FloatArray
     """H' S^-1 y, shape (n,)."""
     weight: FloatArray
-    """H' S^-1 H, shape (n, n); with it I - K H = I - P_{j|j-1} weight."""
+    """H' S^-1 H, shape (n, n). I - K H is I - P_{j|j-1} weight."""
 
 
 class RewindForget(WindowedFilter):
@@ -68,7 +68,7 @@ class RewindForget(WindowedFilter):
         self._steps = [
             FilterStep(prior.stamp_ns, x, P, x, P, np.zeros_like(x), np.zeros_like(P))
         ]
-        """In order of their stamps, the first of them the prior."""
+        """Steps in the order of their stamps. The first step is the prior."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
@@ -113,7 +113,7 @@ class RewindForget(WindowedFilter):
         return self._fuse_next(measurement)
 
     def _left(self, stamp_ns: int) -> int:
-        """Return the index of the last step that is not after `stamp_ns`; 0 if all steps are after it."""
+        """Return the index of the last step at or before `stamp_ns`; 0 if all steps are later."""
         return max(
             bisect.bisect_right(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
             - 1,
@@ -134,10 +134,11 @@ class RewindForget(WindowedFilter):
         return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
 
     def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Add a step at the present stamp with the state after a late measurement: `mean` (n,), `covariance` (n, n).
+        """Add a step at the present stamp with the state after a late measurement: `mean` (n,), `covariance`
+        (n, n).
 
-        Its measurement is the equivalent one of Bar-Shalom, Chen and Mallick 2004: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H
-        = P^-1 (P - P+) P^-1.
+        The step has the equivalent measurement of Bar-Shalom, Chen and Mallick 2004: H' S^-1 y = P^-1 (x+ - x),
+        H' S^-1 H = P^-1 (P - P+) P^-1.
         """
         now = self._steps[-1]
         gained = psd_solve(now.covariance, now.covariance - covariance)
@@ -159,7 +160,7 @@ class Drop(RewindForget):
     """
 
     def _fuse_late(self, measurement: Measurement) -> None:
-        """Nothing."""
+        """Return None: the measurement is ignored."""
 
 
 class AsCurrent(RewindForget):
@@ -203,7 +204,7 @@ class Fpfd(RewindForget):
         return Correction(x, P, at_tau.innovation, at_tau.nis, at_tau.weight, at_tau.S)
 
     def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
-        """One estimate from `now` and `late`, which share the information of `common`."""
+        """Return the fusion of the estimates `now` and `late`, which share the information of `common`."""
         P_k, P_1, P_0 = (information(P) for _, P in (now, late, common))
         covariance = symmetrise(information(P_k + P_1 - P_0))
         pull = P_1 @ (late[0] - now[0]) - P_0 @ (common[0] - now[0])

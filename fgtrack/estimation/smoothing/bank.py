@@ -37,25 +37,26 @@ from fgtrack.models.motion import MotionModel
 
 
 class SmootherBank(Stateful):
-    """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together.
-    The least squares are those of a factor graph (Dellaert & Kaess, IJRR 25(12), 2006), with late measurements as in
-    Ranganathan, Kaess & Dellaert, IROS 2007.
+    """Fixed-lag smoothers of all objects, solved together in covariance form by compiled loops.
 
-    Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node of a window is the
-    newest one at or before its start, so every stamp inside has a left neighbour.
+    The least-squares problem is that of a factor graph (Dellaert & Kaess, IJRR 25(12), 2006), with late
+    measurements as in Ranganathan, Kaess & Dellaert, IROS 2007.
+
+    Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node of a window is
+    the newest node at or before its start, so every stamp inside the window has a left neighbour.
 
     Parameters
     ----------
     motion
-        Motion model; its process noise composes, so a late measurement may split a segment.
+        Motion model. Its process noise composes, so a late measurement may split an interval.
     lag_s
         Length of the windows.
     initiation
-        How the direction of travel of a new object is estimated where nothing else gives one, see `Initiation`.
+        Method for the direction of travel of a new object, if nothing else gives a direction, see `Initiation`.
     failures
-        Counts how often windows are rebuilt and steps are damped.
+        Counts rebuilt windows and damped steps.
     options
-        Further `SmootherSettings`; lagged and final states are reported on request.
+        Further `SmootherSettings`. Lagged and final states are reported only if the options ask for them.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -86,7 +87,7 @@ class SmootherBank(Stateful):
         lag_s: float,
         initiation: str = DEFAULT,
         failures: Failures | None = None,
-        **options: Any,  # any value that a setting takes
+        **options: Any,  # Any: each setting has its own type
     ) -> None:
         self._motion = motion
         self._settings = settings = SmootherSettings.of_options(lag_s, options)
@@ -105,14 +106,14 @@ class SmootherBank(Stateful):
         self.present_ns = 0
         """See `TrackBank.present_ns`."""
         self._clock_ns = 0
-        """Latest of them."""
+        """Latest present so far."""
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
         """Initiations of the tracks whose direction is sought, by row."""
         self._order: tuple[IntArray, tuple[int, ...]] | None = None
-        """Rows and ids of all tracks, until one comes or goes."""
+        """Rows and ids of all tracks; None after a birth or removal."""
         self._known: dict[int, StatesAt] = {}
-        """By stamp, until something changes."""
+        """States by stamp; cleared by every change."""
         self._final: list[SmoothedReport] = []
         """States of nodes that have left the windows since the last call of `smoothed`."""
 
@@ -130,10 +131,10 @@ class SmootherBank(Stateful):
         """See `TrackBank.advance`; the nodes that leave are marginalised at the next update."""
         self.present_ns = now_ns
         self._clock_ns = max(self._clock_ns, now_ns)
-        self._known.clear()  # which tracks are known at a stamp depends on the clock
+        self._known.clear()  # the clock decides which tracks have a state at a stamp
 
     def states_at(self, stamp_ns: int) -> StatesAt:
-        """See `TrackBank.states_at`. Raises `EstimatorError` if some tracks have no state."""
+        """See `TrackBank.states_at`. Raises `EstimatorError` if the states of some tracks cannot be computed."""
         known = self._known.get(stamp_ns)
         if known is None:
             tracks, track_ids = self._all()
@@ -150,7 +151,7 @@ class SmootherBank(Stateful):
     def _states(
         self, tracks: IntArray, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return `Solver.states_at`. Raises `EstimatorError` for the tracks of which the solver raises."""
+        """Return `Solver.states_at`. Raises `EstimatorError` with the tracks for which the solver raises."""
         try:
             return self.solver.states_at(tracks, stamps_ns)
         except MemoryError:
@@ -208,8 +209,10 @@ class SmootherBank(Stateful):
         states: StatesAt,
         of: Sequence[int],
     ) -> list[UpdateResult]:
-        """Return the outcomes of a stack of measurements of tracks, whose `states` are in the rows `of`.
-        Of a stack that raises, the measurements of the tracks whose states are as before are fused alone.
+        """Return the results of a stack of measurements, one for each of `track_ids`, whose `states` are in the
+        rows `of`.
+
+        If the stack raises, the measurements of the unchanged tracks are fused one by one.
         """
         try:
             return self._fused(track_ids, stack, states, of)
@@ -239,7 +242,9 @@ class SmootherBank(Stateful):
         states: StatesAt,
         of: Sequence[int],
     ) -> list[UpdateResult]:
-        """Return the outcomes of `_update` of all tracks together. Raises `EstimatorError` for those that raise."""
+        """Return the results of `_update` for all tracks together. Raises `EstimatorError` for the tracks that
+        fail.
+        """
         with changing_nothing(track_ids):
             alike, tracks = (
                 stack.seen_by(self._motion),
@@ -325,8 +330,9 @@ class SmootherBank(Stateful):
         self._known.clear()
 
     def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`; what was still inside the window becomes final.
-        Raises `EstimatorError` where these states cannot be computed: the track is removed all the same.
+        """See `TrackBank.remove`; the states inside the window become final.
+
+        Raises `EstimatorError` if these states cannot be computed. The track is removed in this case, too.
         """
         track = self._tracks.pop(track_id)
         self._free.append(track)
@@ -345,7 +351,7 @@ class SmootherBank(Stateful):
                 raise EstimatorError({track_id: error}, {}) from error
 
     def present(self) -> Sequence[TrackState]:
-        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
+        """See `TrackBank.present`. An object whose first stamp is after the present has its first state."""
         tracks, _ = self._all()
         states = self._states(
             tracks, np.maximum(self.present_ns, self._windows(tracks)[2])
@@ -375,9 +381,11 @@ class SmootherBank(Stateful):
         )
 
     def withdraw(self, track_id: int, measurement: Measurement) -> bool:
-        """Solve a track without a measurement, as if it had never been fused. Return False if it is not there.
+        """Solve a track without a measurement, as if it had never been fused. Return False if the window does
+        not have it.
 
-        A state that only this measurement needed goes with it. Raises `EstimatorError` where the rest cannot be solved.
+        A state that only this measurement needed is removed, too. Raises `EstimatorError` if the remaining
+        window cannot be solved.
         """
         track = self._tracks[track_id]
         self._known.clear()
@@ -389,7 +397,7 @@ class SmootherBank(Stateful):
         return True
 
     def converge(self, max_iterations: int = 50) -> None:
-        """Relinearise until nothing moves; for comparisons."""
+        """Relinearise and solve all windows until no state moves. For comparisons."""
         for track in self._tracks.values():
             self.solver.converge(track, max_iterations)
         self._known.clear()
@@ -406,21 +414,23 @@ class SmootherBank(Stateful):
         return [*map(SmoothedReport, track_ids, states, repeat(lag_s))]
 
     def _improved(self, tracks: IntArray, stamp_ns: int) -> dict[int, Exception]:
-        """Improve windows that have changed; return exceptions by track id. All windows are tried."""
+        """Improve the windows of `tracks`. All windows are tried; return the exceptions by track id."""
         causes = dict[int, Exception]()
         try:
             self._improve(tracks, stamp_ns)
         except Exception:
             for row, track in enumerate(tracks.tolist()):
                 try:
-                    self.solver.relinearise(track)  # it may be between two steps
+                    self.solver.relinearise(
+                        track
+                    )  # an exception may have stopped it between two steps
                     self._improve(tracks[row : row + 1], stamp_ns)
                 except Exception as error:
                     causes[self._ids[track]] = error
         return causes
 
     def _improve(self, tracks: IntArray, stamp_ns: int) -> None:
-        """Initiate, damp and iterate windows with a new measurement at `stamp_ns`."""
+        """Initiate, damp and iterate the windows of `tracks`, which have a new measurement at `stamp_ns`."""
         for track in (
             self._searches.keys() & set(tracks.tolist()) if self._searches else ()
         ):
@@ -434,10 +444,11 @@ class SmootherBank(Stateful):
         self.solver.reweight(settled)
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
-        """Reinitialise from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
-        if (
-            self.solver.nodes.first[track] > 0
-        ):  # a node that left stays behind the window
+        """Restart a track along a straight line, if a new stamp from `oldest_ns` on changes the line.
+
+        A track whose nodes have left the window is not initiated any more.
+        """
+        if self.solver.nodes.first[track] > 0:  # a node has left the window
             del self._searches[track]
             return
         following = self._searches[track].next_line(
@@ -458,8 +469,8 @@ class SmootherBank(Stateful):
         return self._order
 
     def _windows(self, tracks: IntArray) -> IntArray:
-        """Return the newest stamps of `tracks`, the starts of their windows, the oldest stamps that are fused, and the
-        indices of the nodes where the windows will begin, shape (4, m).
+        """Return the windows of `tracks`, shape (4, m): newest stamps, starts of the windows, oldest stamps
+        that can be fused, and indices of the nodes where the windows will begin.
         """
         return self.solver.nodes.windows(
             tracks, self._clock_ns, self._lag_ns, self._behind_ns
@@ -469,8 +480,8 @@ class SmootherBank(Stateful):
 def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
     """Return the status of a fused measurement, from the newest stamp of its track and the start of the window.
 
-    The window follows the clock. With a latency above the lag, it begins after the newest stamp of the track, and a
-    measurement that is older than the window may still be the newest one of the track.
+    The window follows the clock. If the latency exceeds the lag, the window begins after the newest stamp of the
+    track. A measurement that is older than the window may then still be the newest measurement of the track.
     """
     if stamp_ns >= newest_ns:
         return UpdateStatus.IN_SEQUENCE
@@ -482,7 +493,7 @@ def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
 
 
 def _raised(error: EstimatorError, track_ids: Sequence[int]) -> list[UpdateResult]:
-    """Return the answers of `error` for these tracks. Raises an `EstimatorError` of those that have none."""
+    """Return the results of these tracks in `error`. Raises an `EstimatorError` with the tracks that have no result."""
     causes = {
         track_id: error.causes[track_id]
         for track_id in track_ids

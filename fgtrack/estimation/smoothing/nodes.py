@@ -1,9 +1,9 @@
 """The nodes of all windows in arrays, and their linearisation.
 
-Each track has a row of nodes in the order of their stamps; the values of a node are kept under its number, which stays
-the same as long as the node exists, so that an insertion moves no values. The first nodes of a row have left the window
-and are kept for detections that are older. A row takes a number when it needs one, and keeps it: memory follows the
-nodes that exist, and not the longest window times the number of tracks.
+A track has a row of nodes in the order of their stamps. The values of a node stand under its number, which stays the
+same as long as the node exists. So an insertion moves no values. The first nodes of a row have left the window. They
+are kept for older detections. A row takes a number when it needs one, and keeps it. So memory grows with the number of
+nodes, and not with the longest window times the number of tracks.
 """
 
 from collections.abc import Sequence
@@ -51,12 +51,14 @@ from fgtrack.models.transitions import transitions
 
 _FEW_TRACKS, _FEW_NODES, _FEW_VALUES, _FEW_COMPONENTS = 4, 64, 256, 4
 
-#: Arrays with one entry for each number.
+#: Arrays whose first dimension is the number of a node.
 _BY_NUMBER = ("labels", "backs", "points", "blocks", "rows", "marks", "values")
 
 
 class Nodes(Stateful):
-    """Arrays of tracks (tracks, ...), with the order of the nodes, and of numbers (size, ...), with their values."""
+    """Arrays by track (tracks, ...), with the order of the nodes, and arrays by number (size, ...), with their
+    values.
+    """
 
     STATE: ClassVar[tuple[str, ...]] = (
         "tracks",
@@ -80,33 +82,42 @@ class Nodes(Stateful):
             motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
         )
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
-        """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
-        state; 1 if there was a measurement that is not linear."""
+        """Columns: number of nodes; index of the oldest node of the window; index from which on `P` is known;
+        stamp of the first state; level 0 for a linear track, 1 after a nonlinear measurement, 2 after a robust
+        loss.
+        """
         self.stamps_ns: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NEVER)
-        """Shape (tracks, nodes); `NEVER` where there is no node."""
+        """Shape (tracks, nodes); `NEVER` beyond the number of nodes."""
         self.numbers: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NONE)
-        """Shape (tracks, nodes); those beyond the number of nodes are free, `NONE` where the row has no number yet."""
-        self._num_numbers = 0  # that rows have
+        """Shape (tracks, nodes). Numbers beyond the number of nodes are free; `NONE` if the row has not taken a
+        number there.
+        """
+        self._num_numbers = 0  # numbers that rows have taken
         self.labels: IntArray = np.zeros((size, 5), dtype=np.int64)
-        """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
-        next node must be linearised; 1 if the measurements must be; number of measurements that a plug-in models."""
+        """Columns: number of `rows` in use; 1 if a linearisation is newer than the factor graph; 1 if the
+        motion to the next node must be linearised; 1 if the measurements must be linearised; number of
+        measurements that a plug-in models.
+        """
         self.backs = np.zeros((size, n + 1, n + 1))
-        """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C). The last row is the step: the
-        mean relative to the linearisation point x0, given everything."""
+        """[A | b], the node given the next node: x - x0 = A (next - its x0) + b + N(0, C). The last row is the
+        step: the smoothed mean minus the linearisation point x0.
+        """
         self.points, self.blocks = np.zeros((size, 2, n)), np.zeros((size, 6, n, n + 1))
-        """See `kernels`: vectors stand as a last column beside the matrix that moves with them."""
+        """See `node_arrays` and `_share`. A vector stands as the last column beside a matrix."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
         self.marks = np.zeros((size, 3, _FEW_COMPONENTS), dtype=np.int64)
         self.values = np.zeros((size, NUM_VALUES, _FEW_COMPONENTS))
         """Measurements as compiled loops linearise them, see `node_arrays`."""
         self.has_plugins = self.compiled is None
-        """True if plug-ins model the motion, or have modelled a measurement: these are linearised outside the loops."""
+        """True if plug-ins model the motion, or have modelled a measurement. These parts are linearised outside
+        the compiled loops.
+        """
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
         self._share()
 
     def checkpoint(self) -> Snapshot:
-        """See `Stateful.checkpoint`; of the arrays by number it has those in use alone."""
+        """See `Stateful.checkpoint`. Arrays by number are copied as far as their numbers are in use."""
         used, others = self._num_numbers, set(self.STATE).difference(_BY_NUMBER)
         by_number = {
             name: (len(getattr(self, name)), getattr(self, name)[:used].copy())
@@ -131,13 +142,13 @@ class Nodes(Stateful):
         self._share()
 
     def _share(self) -> None:
-        """Name the parts of the arrays."""
+        """Make the views of the arrays and their parts."""
         n = self._motion.dim
         kept = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs)
         self.arrays = (*kept, self.points, self.blocks, self.rows)
-        """Arguments of all loops."""
+        """Arguments of all compiled loops."""
         self.seen = self.marks, self.values
-        """Arguments of the loops that note or linearise measurements."""
+        """Arguments of the compiled loops that write or linearise measurements."""
         self.count, self.first, self.step = (
             self.tracks[:, COUNT],
             self.tracks[:, FIRST],
@@ -147,18 +158,21 @@ class Nodes(Stateful):
             self.points[:, ORIGIN],
             self.points[:, REFERENCE],
         )
-        """x0; the first x0, which the variables of a factor graph are relative to."""
+        """Linearisation point x0, and first x0, to which the variables of a factor graph are relative."""
         self.filtered, self.predicted = (
             self.blocks[:, FILTERED],
             self.blocks[:, PREDICTED],
         )
         self.ahead = self.blocks[:, F, :, n]
-        """Covariances and means relative to x0 after and before the node's own measurements; f(x0), f being the motion
-        to the next node."""
+        """`filtered` and `predicted` are covariances and means relative to x0, after and before the
+        measurements of the node. `ahead` is f(x0), the prediction of x0 to the next node.
+        """
         self.C, self.P, self.F, self.Q = (
             self.blocks[:, k, :, :n] for k in (C, P, F, Q)
         )
-        """C; covariance given everything; derivative of f at x0; noise of the motion."""
+        """Covariance C given the next node; smoothed covariance; derivative of f at x0; process noise to the
+        next node.
+        """
 
     def window(self, track: int) -> IntArray:
         """Return the numbers of all nodes of a window."""
@@ -175,7 +189,7 @@ class Nodes(Stateful):
     def begin_window(
         self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray
     ) -> None:
-        """Make the first node of a new track."""
+        """Make the first node of a new track, with the prior (n,) and (n, n)."""
         while track >= len(self.tracks):
             self._grow(axis=0)
         if self.numbers[track, 0] == NONE:
@@ -199,9 +213,10 @@ class Nodes(Stateful):
         prior_covariance: FloatArray,
         factors: Sequence[Sequence[MeasurementFactor]],
     ) -> None:
-        """Make the window of a new track, with a node for each stamp. Its nodes must still be linearised and solved.
+        """Make the window of a new track, with a node for each stamp. Its nodes must still be linearised and
+        solved.
 
-        `means` (m, n) become the linearisation points. The prior, (n,) and (n, n), is that of the oldest node.
+        `means` (m, n) become the linearisation points. The prior, (n,) and (n, n), belongs to the oldest node.
         """
         self.begin_window(track, stamps_ns[0], prior_mean, prior_covariance)
         while len(stamps_ns) >= self.stamps_ns.shape[1]:
@@ -229,7 +244,7 @@ class Nodes(Stateful):
         is_new: IntArray,
         ahead_s: FloatArray,
     ) -> None:
-        """Keep a stack of measurements, one for each of the nodes `numbers`: all or none."""
+        """Keep a stack of measurements, one for each node in `numbers`. An exception changes nothing."""
         kept = dict[int, list[tuple[Measurements, int, float]]]()
         rows = zip(
             numbers.tolist(),
@@ -243,7 +258,7 @@ class Nodes(Stateful):
         self._factors.update(kept)
 
     def withdraw(self, track: int, index: int, *, is_new: bool, is_noted: bool) -> None:
-        """Take the last measurement of a node out, if it `is_noted`, and the node, if it `is_new`."""
+        """Remove the last measurement of a node if it `is_noted`, and the node itself if it `is_new`."""
         number, last = int(self.numbers[track, index]), self.count[track] - 1
         if is_noted:
             self._factors[number].pop()
@@ -260,9 +275,10 @@ class Nodes(Stateful):
         self.tracks[track, KNOWN] = self.count[track]
 
     def noted_as(self, measurement: Measurement) -> tuple[IntArray, FloatArray, int]:
-        """Return codes (k,), sensor pose with the width of the loss (6,), and kind of the loss in compiled loops.
+        """Return a measurement as compiled loops take it: codes (k,), pose with the width of the loss (6,), and
+        kind of the loss.
 
-        The kind is `PLUGIN` where a plug-in models the measurement or the motion.
+        The kind is `PLUGIN` if a plug-in models the measurement or the motion.
         """
         codes = measurement.model.codes
         loss, width = compiled_form(measurement.loss, len(codes))
@@ -277,7 +293,7 @@ class Nodes(Stateful):
         self._resize(len(self.labels), self.rows.shape[1] + num_rows)
 
     def _note_again(self, number: int) -> None:
-        """Note the measurements of a node in the arrays as `factors` has them now. Their rows are stale afterwards."""
+        """Write the measurements in `factors` of a node into the arrays again. Its rows must then be linearised."""
         factors, row = self.factors(number), 0
         used = sum(len(measurement.z) for measurement, _ in factors)
         if used > self.rows.shape[1]:
@@ -298,7 +314,7 @@ class Nodes(Stateful):
         self.labels[number, NUM_ROWS], self.labels[number, ROWS_STALE] = used, 1
 
     def index_of(self, track: int, measurement: Measurement) -> int | None:
-        """Return the index of the node that has this measurement; None if it was not fused, or is forgotten."""
+        """Return the index of the node with this measurement; None if no node has it."""
         stamps_ns = self.stamps_ns[track, : self.count[track]]
         near = np.abs(stamps_ns - measurement.stamp_ns) <= NEAR_NS
         for index in near.nonzero()[0].tolist():
@@ -308,10 +324,10 @@ class Nodes(Stateful):
         return None
 
     def take_out(self, track: int, index: int, measurement: Measurement) -> None:
-        """Take a measurement out of the node at `index`, and the node too where nothing else needs it.
+        """Remove a measurement from the node at `index`, and the node itself if nothing else needs it.
 
-        The nodes around it must be linearised and solved afterwards. The oldest node of the window keeps the prior,
-        and the oldest node of all is the beginning.
+        The neighbours must be linearised and solved afterwards. The oldest node of the window stays, because it
+        has the prior. The oldest node of all stays, too.
         """
         number = int(self.numbers[track, index])
         orders = [each.order for each, _ in self.factors(number)]
@@ -349,7 +365,7 @@ class Nodes(Stateful):
         self.labels[number, CHANGED], self.labels[number, ROWS_STALE] = 1, 0
 
     def linearise(self, tracks: IntArray, starts: IntArray) -> None:
-        """Linearise the stale nodes of `tracks`, from the one before `starts` on: motion and measurements."""
+        """Linearise measurements and motion of the stale nodes of `tracks`, from the node before `starts` on."""
         compiled = self.compiled
         if self.has_plugins:
             is_node = np.arange(self.numbers.shape[1]) < self.count[tracks, None]
@@ -393,7 +409,9 @@ class Nodes(Stateful):
         return result
 
     def _grow(self, axis: int) -> None:
-        """Double the tracks, or the nodes of each. All is allocated before anything changes, as in other growth."""
+        """Double the number of tracks (`axis` 0) or of nodes (`axis` 1). Memory is allocated before anything
+        changes.
+        """
         shape = [*self.stamps_ns.shape]
         shape[axis] *= 2
         stamps_ns, numbers = np.full(shape, NEVER), np.full(shape, NONE)
@@ -408,7 +426,7 @@ class Nodes(Stateful):
         self._share()
 
     def _take_numbers(self, tracks: IntArray, indices: IntArray) -> None:
-        """Give each of `tracks` (m,) a number for another node, at the index where it has none yet."""
+        """Give each of `tracks` (m,) a number for a further node, at the index in `indices` where it has none."""
         first, end = self._num_numbers, self._num_numbers + len(tracks)
         if end > len(self.labels):
             self._resize(max(end, 2 * len(self.labels)), self.rows.shape[1])
@@ -425,7 +443,9 @@ class Nodes(Stateful):
             shape = [size, *values.shape[1:]]
             if name in ("rows", "marks", "values"):
                 shape[1 if name == "rows" else 2] = width
-            larger.append(np.zeros(shape, values.dtype))  # pages of used numbers alone
+            larger.append(
+                np.zeros(shape, values.dtype)
+            )  # memory is used by these numbers only
             part = tuple(slice(length) for length in (used, *values.shape[1:]))
             larger[-1][part] = values[:used]
         for name, values in zip(_BY_NUMBER, larger, strict=True):

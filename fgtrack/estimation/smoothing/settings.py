@@ -28,20 +28,22 @@ class SmootherSettings:
     lag_s: float = 1.0
     """Length of the window behind the newest stamp of the track, or the clock."""
     late: Literal["fuse", "drop"] = "fuse"
-    """Treatment of a detection older than the window: fused exactly through what the window has marginalised
-    (counted as `beyond_window`), or dropped (`too_old`)."""
+    """Treatment of a detection older than the window. `fuse`: it is fused exactly, through the marginalised states
+    (counted as `beyond_window`). `drop`: it is dropped (`too_old`).
+    """
     ring_s: float = 2.0
-    """Reach of `fuse` behind the window; older detections are `too_old`."""
+    """Time behind the window within which `fuse` applies; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
-    """An entry of the state that moved further than this from its linearisation point is relinearised: at half of it
-    when it is about to leave the window, at a quarter when it is re-solved anyway; see `thresholds` for entries that
-    are not named."""
+    """Thresholds by entry of the state. An entry that moved farther from its linearisation point is relinearised.
+    Half of the threshold applies before a state leaves the window, a quarter if the state is re-solved anyway. See
+    `thresholds` for entries that are not named.
+    """
     max_iterations: int = 1
-    """Gauss-Newton steps per update; further ones are taken only while a state moves."""
+    """Largest number of Gauss-Newton steps per update. Further steps are taken only while a state moves."""
     lagged_s: tuple[float, ...] = (0.3,)
-    """Lags of the lagged output; the first one goes to smoothed.csv."""
+    """Lags of the lagged output; smoothed.csv has the first lag."""
     final: bool = True
-    """True if the smoothed state of a node is given when it leaves the window."""
+    """True if the smoothed state of a node is reported when the node leaves the window."""
 
     def __post_init__(self) -> None:
         not_negative(lag_s=self.lag_s, ring_s=self.ring_s)
@@ -61,13 +63,15 @@ class SmootherSettings:
 
     @property
     def behind_s(self) -> float:
-        """Reach behind the window within which detections are still fused."""
+        """Time behind the window within which detections are still fused."""
         return self.ring_s if self.late == "fuse" else 0.0
 
     @classmethod
     def of_options(cls, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
-        """Settings that report no lagged and no final states unless `options` ask for them.
-        Raises `CallError` for an option that does not exist.
+        """Return settings for the options of an estimator; by default no lagged and no final states are
+        reported.
+
+        Raises `CallError` for an unknown option.
         """
         taken = [each.name for each in fields(cls)]
         if unknown := set(options).difference(taken):
@@ -77,9 +81,10 @@ class SmootherSettings:
         return cls(lag_s=lag_s, **{"lagged_s": (), "final": False, **options})
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
-        """Relinearisation thresholds of the state of `motion`, shape (n,).
-        Motion models are linear in the position. If some measurement is `nonlinear`, or has a robust loss, the position
-        has a threshold as well. Where all is linear, nothing has one.
+        """Return the relinearisation thresholds of the state of `motion`, shape (n,).
+
+        Motion models are linear in the position. If a measurement is `nonlinear`, or has a robust loss, the
+        position has a threshold, too. If everything is linear, no entry has a threshold.
         """
         named = (
             {**_NONLINEAR, **self.relinearise}

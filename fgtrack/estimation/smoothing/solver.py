@@ -1,4 +1,4 @@
-"""The windows of all tracks: measurements inserted, relinearised where a state moved, solved, and read at any stamp."""
+"""The windows of all tracks: insert measurements, relinearise states that moved, solve, and give states at stamps."""
 
 from collections.abc import Collection
 from typing import ClassVar
@@ -31,18 +31,19 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import cost, overshot
 from fgtrack.models.motion import MotionModel
 
-#: A step of a state, in m, rad, m/s or rad/s, that is rounding.
+#: A smaller step of a state, in m, rad, m/s or rad/s, is rounding.
 STEP_TOLERANCE = 1e-7
-#: The least share of a step that is tried, and rounding of a cost.
+#: Smallest share of a step that is tried, and relative rounding of a cost.
 _LEAST_SHARE, _ROUNDING = 1e-6, 1e-9
-#: Of a track with a robust loss, whose weights follow its states: value of `NONLINEAR`, share of the thresholds, steps.
+#: A track with a robust loss: level of `NONLINEAR`, share of the thresholds, and largest number of steps. Its weights
+#: follow its states.
 _ROBUST, _ROBUST_SHARE, _ROBUST_STEPS = 2, 0.1, 3
 Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
-"""Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
+"""Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave a window, oldest first for each track."""
 
 
 class NotFusedError(Exception):
-    """Measurements could not be fused. All states are as before, but those of `lost` tracks are unknown."""
+    """Measurements could not be fused. All states are as before; the states of `lost` tracks are unknown."""
 
     def __init__(self, cause: Exception, lost: Collection[int] = ()) -> None:
         super().__init__(f"not fused ({cause})")
@@ -50,20 +51,20 @@ class NotFusedError(Exception):
 
 
 class Solver(Stateful):
-    """Windows of many tracks, each by its number; solved in covariance form by compiled loops.
+    """The windows of many tracks, by track number, solved in covariance form by compiled loops.
 
     Parameters
     ----------
     motion
-        Motion model of all of them.
+        Motion model of all tracks.
     settings
-        Those of relinearisation and outputs.
+        Settings of relinearisation and outputs.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("nodes",)
 
     is_damped: ClassVar[bool] = False
-    """True if no step makes the fit worse."""
+    """True if the solver accepts no step that increases the cost."""
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         self.motion = motion
@@ -81,14 +82,15 @@ class Solver(Stateful):
         self.nodes.begin_window(track, stamp_ns, mean, covariance)
         self.forget(track)
 
-    # --- solution; a factor graph has its own
+    # --- solution; subclasses with a factor graph override these methods
 
     def forget(self, track: int) -> None:
-        """Forget what was made of a window whose prior, or all, is different now."""
+        """Drop the results for a window whose prior, or whole content, has changed."""
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
-        """Solve windows that have changed from `starts` on and begin at `anchors` from now on.
-        Raises `numpy.linalg.LinAlgError` if it fails.
+        """Solve windows that have changed from `starts` on, and let them begin at `anchors`.
+
+        Raises `numpy.linalg.LinAlgError` if a state is not finite.
         """
         self._solve(tracks, starts, anchors, is_partial=False)
 
@@ -104,8 +106,10 @@ class Solver(Stateful):
     def smoothed(
         self, tracks: IntArray, indices: IntArray, after_s: FloatArray
     ) -> FloatArray:
-        """Make `P` of the nodes at `indices` known, and where `after_s` what the states of those before depend on.
-        Return the means of these nodes, or where `after_s` those before, shape (m, n).
+        """Compute the covariances `P` of the nodes at `indices`, and return means (m, n).
+
+        The mean is that of the node at the index. Where `after_s` > 0, it is the mean of the node before, given
+        this node, and the covariances that an interpolation needs are computed, too.
         """
         means = np.empty((len(tracks), self.motion.dim))
         solution_kernels.smooth(tracks, indices, after_s, self.nodes.arrays, means)
@@ -116,8 +120,10 @@ class Solver(Stateful):
     def states_at(
         self, tracks: IntArray, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
-        They are interpolated, or predicted ahead.
+        """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, at or after the oldest
+        node.
+
+        The states are interpolated, or predicted after the last node.
         """
         nodes, indices = self.nodes, np.empty(len(tracks), dtype=np.int64)
         until_s, after_s = np.empty((2, len(tracks)))
@@ -133,12 +139,12 @@ class Solver(Stateful):
         return mean, Q
 
     def estimates(self, track: int) -> FloatArray:
-        """Means of all nodes in the window, shape (m, n)."""
+        """Return the means of all nodes in the window of a track, shape (m, n)."""
         numbers = self.nodes.window(track)
         return np.asarray(self.nodes.origin[numbers] + self.nodes.step[numbers])
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving | None:
-        """Return the states of the nodes before `anchors`, if wanted."""
+        """Return the states of the nodes before `anchors`; None if no node leaves."""
         nodes = self.nodes
         num = anchors - nodes.first[tracks]
         if not num.any():
@@ -163,11 +169,13 @@ class Solver(Stateful):
         R: FloatArray,
         anchors: IntArray,
     ) -> Leaving | None:
-        """Fuse a stack of measurements, one of each of `tracks`, and let the windows begin at the indices `anchors`.
+        """Fuse a stack of measurements, one of each of `tracks`, and let the windows begin at the indices
+        `anchors`.
 
-        Their innovations at `guesses`, the states (m, n) at their stamp, are `y` (m, k), with Jacobians `H`, (1, k, n)
-        or (m, k, n), and covariances `R` (m, k, k). A measurement that is older changes the prior of its window.
-        Returns the smoothed states of the nodes that left, if wanted. Raises `NotFusedError` where a step raises.
+        `y` (m, k) are the innovations at `guesses`, the states (m, n) at the stamp of the stack. `H`, (1, k, n)
+        or (m, k, n), are their Jacobians, and `R` (m, k, k) the covariances. A measurement that is older than
+        its window changes the prior of the window. Returns the smoothed states of the nodes that left, if final
+        states are reported. Raises `NotFusedError` if a step raises.
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         ahead_s, out = np.empty(len(tracks)), np.empty((8, len(tracks)), dtype=np.int64)
@@ -223,7 +231,7 @@ class Solver(Stateful):
         return leaving
 
     def withdraw(self, track: int, measurement: Measurement) -> bool:
-        """Solve the window of a track without a measurement that was fused. Return False if no node has it."""
+        """Solve the window of a track without a fused measurement. Return False if no node has the measurement."""
         nodes, index = self.nodes, self.nodes.index_of(track, measurement)
         if index is None:
             return False
@@ -234,8 +242,10 @@ class Solver(Stateful):
     def _not_restored(
         self, tracks: IntArray, starts: IntArray | None = None
     ) -> list[int]:
-        """Solve windows without a measurement that was withdrawn, see `relinearise`; return those that raise.
-        A window that cannot be solved without it either keeps its last states.
+        """Solve windows again after a measurement was withdrawn, see `relinearise`. Return the tracks for which
+        this raises.
+
+        A window that cannot be solved without the measurement keeps its last states.
         """
         lost = list[int]()
         for row, track in enumerate(tracks.tolist()):
@@ -250,7 +260,7 @@ class Solver(Stateful):
         return lost
 
     def _refilter(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
-        """Filter from `starts`, which lie behind the windows, up to `anchors`, where these begin: with other priors."""
+        """Filter nodes from `starts`, which lie behind the windows, up to `anchors`: the windows get new priors."""
         starts = np.minimum(starts, self.nodes.first[tracks])
         self.nodes.first[tracks] = 0
         self._solve(tracks, starts, anchors, is_partial=True)
@@ -261,8 +271,8 @@ class Solver(Stateful):
     def _marked_nonlinear(
         self, tracks: IntArray, stack: Measurement, guesses: FloatArray
     ) -> FloatArray:
-        """States at its stamp after the relinearisation of tracks whose first nonlinear or robust measurement comes.
-        From now on, these have other thresholds.
+        """Relinearise tracks whose first nonlinear measurement, or first robust loss, comes now. Return the
+        states (m, n) at its stamp. These tracks have other thresholds from now on.
         """
         level, stamp_ns = 1 if stack.loss is None else _ROBUST, stack.stamp_ns
         first = (self.nodes.tracks[tracks, NONLINEAR] < level).nonzero()[0]
@@ -279,7 +289,7 @@ class Solver(Stateful):
     # --- relinearisation
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
-        """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
+        """Take Gauss-Newton steps while a state is farther than a threshold from its linearisation point."""
         nodes, far = self.nodes, np.empty(1, dtype=np.int64)
         for _ in range(max_iterations if len(tracks) else 0):
             starts = np.empty(len(tracks), dtype=np.int64)
@@ -295,15 +305,17 @@ class Solver(Stateful):
             self.solve(tracks, starts, nodes.first[tracks])
 
     def reweight(self, tracks: IntArray) -> None:
-        """Take steps of tracks with a robust loss, whose weights follow the states."""
+        """Take further steps for tracks with a robust loss, whose weights follow the states."""
         is_robust = self.nodes.tracks[tracks, NONLINEAR] == _ROBUST
         self.iterate(tracks[is_robust], _ROBUST_STEPS)
 
     def relinearise(
         self, track: int, means: FloatArray | None = None, start: int = NEVER
     ) -> None:
-        """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it.
-        From index `start` on, if that lies behind the window.
+        """Linearise a window, and solve it. If `start` lies behind the window, begin at the node with this
+        index.
+
+        The linearisation points become `means`, shape (m, n); without `means` they stay.
         """
         nodes, tracks = self.nodes, np.array([track])
         first = nodes.first[tracks]
@@ -318,9 +330,10 @@ class Solver(Stateful):
         self.solve(tracks, first, first)
 
     def converge(self, track: int, max_iterations: int = 100) -> None:
-        """Solve with all states linearised where the last step led, until none moves by more than rounding.
-        Half a step is taken where a whole one comes no closer, or does not lower the cost: process noise that follows
-        its state can make Gauss-Newton oscillate.
+        """Relinearise a window at its solution and solve it, until no state moves by more than rounding.
+
+        A step is halved if it is not much shorter than the last step, or does not lower the cost. Process noise
+        that depends on the state can make Gauss-Newton oscillate.
         """
         means, last = self.estimates(track), np.inf
         for _ in range(max_iterations):
@@ -340,7 +353,9 @@ class Solver(Stateful):
             means, last = means + share * steps, longest
 
     def _cost(self, track: int, means: FloatArray) -> float:
-        """Half of the sum of squares of a window at `means` (m, n), and the robust losses of those that have one.
+        """Return half of the sum of squares of a window at `means` (m, n), with the robust losses of the
+        measurements.
+
         The process noise is that of the linearisation points.
         """
         nodes, n, numbers = self.nodes, self.motion.dim, self.nodes.window(track)
@@ -357,7 +372,7 @@ class Solver(Stateful):
         return 0.5 * float(total) + self._measurement_cost(track, means)
 
     def _measurement_cost(self, track: int, means: FloatArray) -> float:
-        """Sum of the losses of the measurements of a window at `means` (m, n)."""
+        """Return the sum of the losses of the measurements of a window at `means` (m, n)."""
         nodes = self.nodes
         compiled = nodes.compiled
         if compiled is None or nodes.has_plugins:
@@ -377,7 +392,9 @@ class Solver(Stateful):
         return total
 
     def damp(self, tracks: IntArray) -> int:
-        """Converge in damped steps where the last one left the range of its linearisation; return how many tracks."""
+        """Converge, with damped steps, the tracks whose last step left its linear range. Return the number of
+        these tracks.
+        """
         nodes = self.nodes
         nonlinear = tracks[nodes.tracks[tracks, NONLINEAR] > 0]
         if self.is_damped or not nonlinear.size:
@@ -392,7 +409,7 @@ class Solver(Stateful):
         return len(overshot_tracks)
 
     def _overshot(self, tracks: IntArray) -> BoolArray:
-        """True for tracks with a node whose step left the linear range of a measurement, shape (m,)."""
+        """Mask (m,) of the tracks with a node whose step left the linear range of a measurement."""
         nodes, compiled = self.nodes, self.nodes.compiled
         far = np.empty(nodes.stamps_ns.shape[1], dtype=np.int64)
         found = np.zeros(len(tracks), dtype=bool)
@@ -427,7 +444,7 @@ class Solver(Stateful):
     # --- initiation
 
     def fixes(self, track: int) -> list[Fix]:
-        """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
+        """Return the position of the prior and the measured positions of a window that no node has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
         prior, begin_ns = (
             nodes.predicted[numbers[0]],
@@ -442,7 +459,9 @@ class Solver(Stateful):
         )
 
     def restart(self, track: int, line: Line) -> None:
-        """Re-solve from states along `line`, with the prior's heading, which must be vague, turned there."""
+        """Solve a window again from states along `line`. The heading of the prior must be vague; it is turned
+        to the line.
+        """
         nodes, oldest = self.nodes, self.nodes.window(track)[0]
         times_s = (
             nodes.window_stamps_ns(track) - nodes.tracks[track, BEGIN_NS]

@@ -11,10 +11,10 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 
-#: Stamps at most so far apart share a node of a factor graph: the process noise between them is all but singular.
+#: Stamps at most this far apart share a node. The process noise between two nodes would be nearly singular.
 NEAR_NS = 1_000
 MeasurementFactor = tuple[Measurement, float]
-"""A measurement of a node, and the time from the node's stamp to its own, whose process noise is neglected."""
+"""A measurement of a node, and the time from the stamp of the node to its own stamp. Its process noise is neglected."""
 
 
 def linearised(
@@ -33,7 +33,9 @@ def linearised(
 def whitened(
     factor: MeasurementFactor, x: FloatArray, motion: MotionModel
 ) -> FloatArray:
-    """Linearise `factor` at `x` (n,), weighted by its loss there: rows [G | y] of y = G (x - x0) + N(0, I), (k, n + 1).
+    """Linearise `factor` at `x` (n,), weighted by its loss: rows [G | y] of y = G (x' - x) + N(0, I), shape (k, n +
+    1).
+
     Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
     """
     y, H = linearised(factor, x, motion)
@@ -46,7 +48,7 @@ def whitened(
 
 
 def cost(factor: MeasurementFactor, x: FloatArray, motion: MotionModel) -> float:
-    """Half of the squared Mahalanobis distance of `factor` from the state `x` (n,), or its robust loss there."""
+    """Return half of the squared Mahalanobis distance of `factor` from the state `x` (n,), or its robust loss."""
     y, _ = linearised(factor, x, motion)
     return penalty(
         factor[0].loss, math.sqrt(mahalanobis_squared(y, factor[0].R)), len(y)
@@ -59,8 +61,10 @@ def overshot(
     mean: FloatArray,
     motion: MotionModel,
 ) -> bool:
-    """True if the step from the linearisation point `origin` to `mean`, both (n,), left the linear range of a factor.
-    There the linearisation predicts a measurement wrong by more than a standard deviation.
+    """True if the step from the linearisation point `origin` to `mean`, both (n,), left the linear range of a
+    factor.
+
+    Outside this range the linearisation predicts a measurement wrong by more than a standard deviation.
     """
     for factor in factors:
         model = factor[0].model

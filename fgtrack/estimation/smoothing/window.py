@@ -34,7 +34,7 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Differences of a result of gtsam to a window, in standard deviations."""
+    """Differences between a result of gtsam and a window, in standard deviations."""
 
     state_names: tuple[str, ...]
     stamps_ns: tuple[int, ...]
@@ -148,10 +148,10 @@ class Window:
         return graph, values_of(keys, self.converged.states), key_of
 
     def compare(self, result: "gtsam.Values", prefix: str | None = None) -> Comparison:
-        """Return the differences of the states in `result` to this window, in standard deviations.
+        """Return the differences between the states in `result` and this window, in standard deviations.
 
-        `prefix` is that of `to_gtsam`; it may be left out where the states of one window alone are in `result`. Raises
-        `CallError` if `result` lacks the states.
+        `prefix` is the prefix of `to_gtsam`. It may be omitted if `result` has the states of one window only.
+        Raises `CallError` if `result` lacks the states.
         """
         if prefix is None:
             prefix = self._only_prefix(result)
@@ -225,7 +225,7 @@ def window_of(solver: Solver, track: int) -> Window:
 
 
 def _in_state_of(motion: MotionModel, measurement: Measurement) -> Measurement:
-    """Return `measurement` with a model of the whole state of `motion`, and not of its first entries alone."""
+    """Return `measurement` with a measurement model for the whole state of `motion`, not only for its first entries."""
     model = measurement.model
     if type(model) is not MeasurementModel or model.state_names == motion.state_names:
         return measurement

@@ -1,4 +1,4 @@
-"""The slow check: Levenberg-Marquardt on the whole window at every update, with factors that call the models."""
+"""A slow reference: Levenberg-Marquardt on the whole window at every update, with factors that call the models."""
 
 from typing import ClassVar
 
@@ -15,8 +15,10 @@ from fgtrack.estimation.smoothing.solver import Solver
 
 
 class BatchSolver(IncrementalSolver):
-    """Windows that Levenberg-Marquardt solves from their last estimates; a prior replaces what leaves them.
-    Process noise stays that of the linearisation point; all else is relinearised at every step.
+    """Windows that Levenberg-Marquardt solves from their last estimates. A prior replaces the states that leave a
+    window.
+
+    Process noise stays that of the linearisation point. All other terms are relinearised at every step.
     """
 
     is_damped: ClassVar[bool] = True
@@ -24,7 +26,7 @@ class BatchSolver(IncrementalSolver):
     def optimise(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> gtsam.Values:
-        """Return the values near `values` with the least error."""
+        """Return the values with the smallest error, starting from `values`."""
         params = gtsam.LevenbergMarquardtParams()
         params.setLinearSolverType("MULTIFRONTAL_QR")
         params.setRelativeErrorTol(1e-12)
@@ -32,7 +34,7 @@ class BatchSolver(IncrementalSolver):
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
     def checkpoint(self) -> Snapshot:
-        """See `Stateful.checkpoint`; of the graphs it has the last estimates."""
+        """See `Stateful.checkpoint`. Graphs are not copied: the checkpoint has their last estimates."""
         estimates = {
             track: {
                 number: values.atVector(number)
@@ -44,7 +46,7 @@ class BatchSolver(IncrementalSolver):
         return {**super().checkpoint(), "estimates": estimates}
 
     def restore(self, snapshot: Snapshot) -> None:
-        """See `Stateful.restore`; the graphs are made again, and not solved."""
+        """See `Stateful.restore`. The graphs are made from the last estimates, but not solved."""
         Solver.restore(self, snapshot)
         self._graphs.clear()
         self._read.clear()
@@ -55,7 +57,7 @@ class BatchSolver(IncrementalSolver):
             self._graphs[track] = self._graph(track), values
 
     def _graph(self, track: int) -> gtsam.NonlinearFactorGraph:
-        """Return the nonlinear factors of a window, with a prior instead of what has left it."""
+        """Return the nonlinear factors of a window, with a prior that replaces the states that have left it."""
         nodes, n = self.nodes, self.motion.dim
         numbers = nodes.window(track).tolist()
         oldest = nodes.predicted[numbers[0]]
@@ -88,7 +90,7 @@ class BatchSolver(IncrementalSolver):
                 nodes.step[number] = values.atVector(number) - nodes.origin[number]
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        """See `IncrementalSolver._covariance`; from one dense QR of the whole linearised window."""
+        """See `IncrementalSolver._covariance`; computed by one dense QR of the whole linearised window."""
         graph, values = self._graphs[track]
         ordering, n = gtsam.Ordering(), self.motion.dim
         for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):
@@ -100,7 +102,7 @@ class BatchSolver(IncrementalSolver):
 
 
 class BatchBank(SmootherBank):
-    """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves at every update: slow, for checks."""
+    """Fixed-lag smoother: a factor graph that Levenberg-Marquardt solves at every update. Slow, for checks."""
 
     make_solver = BatchSolver
     tolerance = 1e-6  # it compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m

@@ -30,7 +30,7 @@ _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
     "geman_mcclure": mEstimator.GemanMcClure.Create,
     "dcs": lambda width: mEstimator.DCS.Create(
         width * width
-    ),  # gtsam's is in squared standard deviations
+    ),  # gtsam counts in squared standard deviations
 }
 _SHIPPED = (CTRV, CTRA, CT, CV)
 #: Half of the interval over which motion is differentiated by time.
@@ -82,8 +82,8 @@ def measurement_factor(
 ) -> gtsam.NonlinearFactor:
     """Return the factor of a measurement on the state at `key`, with its robust loss.
 
-    The sensor pose is that of the measurement, or a variable. A measured position or yaw is then the one that the
-    sensor saw from the pose of the measurement: the factor compares it with the object as seen from the variable.
+    The sensor pose is the pose of the measurement, or a variable. With a variable, a measured position or yaw is first
+    expressed relative to the pose of the measurement. The factor compares it with the object relative to the variable.
 
     Parameters
     ----------

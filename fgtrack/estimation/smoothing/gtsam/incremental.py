@@ -18,17 +18,18 @@ from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
 
 _Changed = dict[int, gtsam.JacobianFactor]
-"""Factors by node."""
+"""Factors by the number of their node."""
 _PRIOR = -1
-"""Instead of a node: the prior of the oldest one that the graph began with."""
+"""Key of the prior of the oldest node with which the graph began; it replaces a node number."""
 _unit = cache(gtsam.noiseModel.Unit.Create)
 
 
 class _Graph:
-    """The factor graph of a window; its variables have the numbers of the nodes, and the values 0.
-    iSAM2 with QR, because Cholesky fails for stamps close together. It is given linear factors only, so it never calls
-    back into Python: what has to be linearised elsewhere is replaced. It eliminates in the order of the stamps: a late
-    measurement leaves alone what is older, and nodes that have left the window are leaves of the Bayes tree.
+    """The factor graph of a window. Its variables have the numbers of the nodes, and the values 0.
+
+    iSAM2 uses QR, because Cholesky fails for stamps close together. It gets linear factors only, so it never calls
+    back into Python; a factor that was linearised again is replaced. It eliminates in the order of the stamps. So a
+    late measurement does not change older states, and nodes that leave the window are leaves of the Bayes tree.
     """
 
     def __init__(self) -> None:
@@ -41,7 +42,9 @@ class _Graph:
         params.setOptimizationParams(gauss_newton)
         self.isam = gtsam.ISAM2(params)
         self.slots: dict[int, int | None] = {}
-        """Slot of the factor of each node, of its measurements and its motion to the next one, if it has any."""
+        """Slot in iSAM2 of the factor of each node (its measurements and its motion to the next node); None
+        without a factor.
+        """
         self._newest = -1
 
     def solve(
@@ -52,23 +55,23 @@ class _Graph:
         first: int,
         changed: _Changed,
     ) -> FloatArray:
-        """Return the states of the nodes `numbers`, one after the other, without the first ones, which are leaving.
-        The factors that have `changed` replace those of the same nodes, from index `first` on; `values` are those of
-        new nodes.
+        """Return the states of the nodes `numbers` as one vector, without the first `num_leaving` nodes, which
+        leave the graph.
+
+        The factors that have `changed` replace the factors of the same nodes, from index `first` on. `values`
+        are the values of new nodes.
         """
         factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
         for factor in changed.values():
             factors.push_back(factor)
-        if (
-            first and numbers[first] == self._newest
-        ):  # in one clique with the node before it
+        if first and numbers[first] == self._newest:  # both nodes are in one clique
             first -= 1
         for group, number in enumerate(numbers[first:]):
             order.insert2(number, group)
         removed = [slot for slot in map(self.slots.get, changed) if slot is not None]
         graph = gtsam.LinearContainerFactor.ConvertLinearGraph(
             factors
-        )  # in half the time of one by one
+        )  # faster than one by one
         added = self.isam.update(graph, values, removed, order).getNewFactorsIndices()
         self.slots.update(zip(changed, added, strict=False))
         self._newest = numbers[-1]
@@ -82,26 +85,29 @@ class _Graph:
 
 
 class IncrementalSolver(Solver):
-    """Windows that iSAM2 solves, with factors that a compiled loop linearises, of all tracks at once.
-    Means and covariances come from a factor graph each; what leaves it is kept as in `Solver`. A track has no graph
-    before something is fused: most tracks of clutter end as they began.
+    """Windows that iSAM2 solves. A compiled loop linearises the factors of all tracks.
+
+    Each track has its own factor graph, which gives means and covariances. States that leave the graph are kept as
+    in `Solver`. A track has no graph before its first fusion, because most tracks of clutter end before it.
     """
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
-        self._graphs: dict[int, Any] = {}  # Any: a subclass has its own
+        self._graphs: dict[int, Any] = {}  # Any: a subclass has its own type
         self._read = set[tuple[int, ...]]()
-        """Nodes, and pairs of them, whose covariances were read since something was solved."""
+        """Nodes, and pairs of nodes, whose covariances were read since the last solution."""
 
     def checkpoint(self) -> Snapshot:
-        """See `Stateful.checkpoint`; of the graphs it has only which windows have one."""
+        """See `Stateful.checkpoint`. Graphs are not copied: the checkpoint only names the windows that have a
+        graph.
+        """
         return {**super().checkpoint(), "solved": tuple(self._graphs)}
 
     def restore(self, snapshot: Snapshot) -> None:
-        """See `Stateful.restore`. iSAM2 cannot be copied, so each graph is made again from its window.
+        """See `Stateful.restore`. iSAM2 cannot be copied, so each graph is made from its window.
 
-        The new graph has equal factors and points of linearisation, and eliminates all factors at once. States then
-        differ by rounding from those of the tracker that went on: less than 1e-9 standard deviations.
+        The new graph has equal factors and linearisation points, and eliminates all factors at once. Its states
+        differ from those of the uninterrupted tracker by rounding: less than 1e-9 standard deviations.
         """
         super().restore(snapshot)
         self._graphs.clear()
@@ -119,7 +125,7 @@ class IncrementalSolver(Solver):
     def smoothed(
         self, tracks: IntArray, indices: IntArray, after_s: FloatArray
     ) -> FloatArray:
-        """See `Solver.smoothed`; inside the windows from the graphs."""
+        """See `Solver.smoothed`. Inside the windows, means and covariances come from the graphs."""
         nodes, n = self.nodes, self.motion.dim
         rows = zip(
             tracks.tolist(),
@@ -129,7 +135,7 @@ class IncrementalSolver(Solver):
             strict=True,
         )
         for track, index, first, time_s in rows:
-            if track not in self._graphs:  # nothing was fused: there is one node
+            if track not in self._graphs:  # nothing was fused: the window has one node
                 continue
             last = max(index, first)
             numbers = tuple(
@@ -144,7 +150,7 @@ class IncrementalSolver(Solver):
             for number in right:
                 A = psd_solve(
                     P[n:, n:], P[n:, :n]
-                ).T  # the state on the left, given this one
+                ).T  # the left state, given this state
                 nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
                     A,
                     nodes.step[left] - A.dot(nodes.step[number]),
@@ -179,16 +185,18 @@ class IncrementalSolver(Solver):
         nodes.tracks[tracks, KNOWN] = anchors
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        """Return the joint covariance of one node, shape (n, n), or of two neighbours, (2 n, 2 n)."""
+        """Return the joint covariance of one node, shape (n, n), or of two neighbours, shape (2 n, 2 n)."""
         isam: gtsam.ISAM2 = self._graphs[track].isam
         if len(numbers) == 1:
             return isam.marginalCovariance(numbers[0])
         return isam.jointMarginalCovariance(list(numbers)).fullMatrix()
 
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
-        """Solve the graphs of `tracks` without what has left the windows, which began at index `starts` before.
-        Writes `step` of the nodes in the windows. Raises `RuntimeError`, `ValueError` or `IndexError` if it fails; then
-        only a new graph helps.
+        """Solve the graphs of `tracks` without the nodes that have left the windows, which began at index
+        `starts` before.
+
+        Writes `step` of the nodes in the windows. Raises `RuntimeError`, `ValueError` or `IndexError` if this
+        fails; then only a new graph helps.
         """
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
         leaving = (nodes.first[tracks] - starts).tolist()
