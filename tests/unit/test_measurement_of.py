@@ -52,9 +52,9 @@ def test_values_are_ordered_as_the_model_orders_them() -> None:
         ),
         (
             {"x_m": 1.0, "y_m": 2.0, "std": {"x_m": 0.3}},
-            "std must name the same, names x_m",
+            "std must name these components, names x_m",
         ),
-        ({"x_m": 1.0, "std": STD}, "std must name the same, names x_m, y_m"),
+        ({"x_m": 1.0, "std": STD}, "std must name these components, names x_m, y_m"),
         (
             {"x_m": 1.0, "yaw_rad": 2.0, "std": 0.3},
             "std: must be a mapping of x_m, yaw_rad to numbers, or one number",

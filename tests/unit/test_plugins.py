@@ -189,7 +189,7 @@ class LackingBank:
     [
         (Raising, r"plug-in x:Y of odd 1\.0 cannot be made \(RuntimeError: oh\)"),
         (Leaving, r"plug-in x:Y of odd 1\.0 cannot be made \(SystemExit: 0\)"),
-        (5, r"odd: 5 is no class or function of Python"),
+        (5, r"odd: 5 is not a class or function: correct the entry point"),
         (LackingBank, r"'odd' makes a LackingBank, which lacks a member of TrackBank"),
     ],
     ids=["raises", "leaves", "number", "bank"],
