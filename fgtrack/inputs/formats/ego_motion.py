@@ -2,13 +2,13 @@
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from operator import attrgetter
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import EgoState
+from fgtrack.core.types import EgoState, Message
 
 MOTION = ("yaw_rad", "speed_mps", "yaw_rate_radps")
 """Components of the ego that are computed if the recording does not measure them."""
@@ -122,6 +122,19 @@ def missing_motion(given: Collection[str]) -> tuple[str, ...]:
     """
     missing = tuple(name for name in MOTION if name not in given)
     return () if missing == MOTION[2:] else missing
+
+
+def with_motion(
+    messages: Iterator[Message], missing: Collection[str]
+) -> Iterator[Message]:
+    """Return `messages` with the `missing` components of the ego's states."""
+    if not missing:
+        return messages
+    motion = EgoMotion(missing)
+    return (
+        motion.completed(each) if isinstance(each, EgoState) else each
+        for each in messages
+    )
 
 
 def completed_states(

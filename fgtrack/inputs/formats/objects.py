@@ -267,12 +267,12 @@ def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
     )
     parts = planar(message.pose.covariance), J @ planar(message.twist.covariance) @ J.T
     full = block_diag(
-        *(part if _is_known(part) else np.zeros_like(part) for part in parts)
+        *(part if is_known_covariance(part) else np.zeros_like(part) for part in parts)
     )
     return tuple(full.ravel().tolist()) if full.any() else None
 
 
-def _is_known(covariance: FloatArray) -> bool:
+def is_known_covariance(covariance: FloatArray) -> bool:
     """True if the covariance is finite and no variance means "unknown": 0 or -1 in ROS, 1e3 or more in many drivers."""
     in_use = (np.diag(covariance) > 0.0) & (np.diag(covariance) < _UNKNOWN)
     return bool(np.isfinite(covariance).all() and in_use.all())

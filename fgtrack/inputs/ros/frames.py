@@ -224,9 +224,28 @@ class BagFrames:
 
     @cached_property
     def map_frame(self) -> str | None:
-        """Frame of the ego's positions, which is the map; None without an ego, or without a name."""
+        """Frame of the ego's positions, which is the map; None without an ego, or without a name.
+
+        If transforms give the ego, it is the usual name of a fixed frame above the ego's
+        frame, else the root.
+        """
         header = getattr(self._ego_message, "header", None)
+        if header is None and hasattr(self._ego_message, "transforms"):
+            above = self.transforms.ancestors(self.ego_frame or "")[1:]
+            ranked = sorted(above, key=lambda frame: _last(frame) not in MAP_FRAMES)
+            best = [each for each in ranked if _last(each) == "map"] or ranked
+            return next(iter(best), None)
         return named(getattr(header, "frame_id", "")) or None
+
+    @cached_property
+    def moving_ego_frame(self) -> str | None:
+        """First frame from the ego's frame upwards that moves in its parent; None if none moves."""
+        chain = self.transforms.ancestors(self.ego_frame or "")
+        edges = self.transforms.edges
+        return next(
+            (each for each in chain if each in edges and not edges[each].is_constant),
+            None,
+        )
 
     @cached_property
     def ego_frame(self) -> str | None:

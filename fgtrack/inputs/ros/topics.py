@@ -20,12 +20,12 @@ from fgtrack.core.types import (
 from fgtrack.inputs.errors import TruncatedInput
 from fgtrack.inputs.formats import ADAPTERS
 from fgtrack.inputs.formats.common import ObjectList, RosMessage, object_id, split
+from fgtrack.inputs.formats.ego_motion import with_motion
 from fgtrack.inputs.formats.fields import (
     EGO_FIELDS,
     OBJECT_FIELDS,
     RELATIVE_IN_MAP,
     FieldError,
-    ego_by_fields,
     is_relative_velocity,
     items_by_fields,
     objects_by_fields,
@@ -33,16 +33,15 @@ from fgtrack.inputs.formats.fields import (
 )
 from fgtrack.inputs.formats.native import (
     DETECTIONS,
-    EGO,
     NATIVE_ADAPTERS,
     TRUTH,
     detections,
 )
-from fgtrack.inputs.formats.objects import ODOMETRY, ego_from_odometry
 from fgtrack.inputs.formats.scans import grouped
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
 from fgtrack.inputs.ros.bag import Bag, BagTopic, is_bag
 from fgtrack.inputs.ros.bag_files import settings_of
+from fgtrack.inputs.ros.ego import computed_motion, ego_states
 from fgtrack.inputs.ros.frames import OPTICAL, BagFrames, Pose, moved_detection
 from fgtrack.inputs.settings import FieldPath, InputConfig, TopicInput
 from fgtrack.inputs.source import FileFormat
@@ -95,7 +94,11 @@ def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
     if not isinstance(truth, tuple):
         truth = (truth,)
     roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
-        *([("ego", config.ego, partial(_ego, plane=plane))] if config.ego else []),
+        *(
+            [("ego", config.ego, partial(_ego, plane=plane, frames=frames))]
+            if config.ego
+            else []
+        ),
         *(
             (
                 f"detections {name}",
@@ -154,11 +157,16 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         for name, each in config.detections.items()
         if each.scan_s is not None
     }
-    return lambda: (
-        grouped(bag_messages(bag, uses), windows_ns)
-        if windows_ns
-        else bag_messages(bag, uses)
-    )
+    missing: tuple[str, ...] = ()
+    for topic, role, _ in uses:
+        if role == "ego" and config.ego is not None:
+            missing = computed_motion(topic, config.ego)
+
+    def messages() -> Iterator[Message]:
+        read = with_motion(bag_messages(bag, uses), missing)
+        return grouped(read, windows_ns) if windows_ns else read
+
+    return messages
 
 
 FORMAT = FileFormat(
@@ -229,20 +237,12 @@ def _native(topic: BagTopic) -> Convert:
     )
 
 
-def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:
-    fields = item.fields
-    if fields is not None:
-        _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-        return lambda message, receipt_ns: (
-            ego_by_fields(message, fields, receipt_ns, plane),
-        )
-    if topic.type == EGO:
-        return _native(topic)
-    if topic.type != ODOMETRY:
-        raise CallError(
-            f"topic {topic.name}: an ego of type {topic.type} needs `fields`; only {ODOMETRY} is read without"
-        )
-    return lambda message, receipt_ns: (ego_from_odometry(message, receipt_ns),)
+def _ego(
+    topic: BagTopic, item: TopicInput, plane: LocalPlane, frames: BagFrames
+) -> Convert:
+    if item.fields is not None:
+        _check_fields(item, EGO_FIELDS, ("x_m", "y_m"))
+    return ego_states(topic, item, plane, frames)
 
 
 def _detections(
