@@ -310,6 +310,7 @@ def _parts(recording: Path, kind: str) -> tuple[list[InputPart], list[str]]:
         parts,
         key=lambda part: (
             part.role != "ego",
+            part.rank,
             not set(words_of(part.label)) & EGO_WORDS,
         ),
     ), refused

@@ -42,6 +42,15 @@ _UNITS = {
     *_SCALES["m"],
     *_SCALES["mps"],
 }
+#: Units of several words, as regular expressions.
+_UNIT_TEXTS = {
+    r"\bkm\s*/\s*h(r|our)?\b": "kmh",
+    r"\bmi\s*/\s*h\b": "mph",
+    r"\bdeg\s*/\s*s(ec)?\b": "degps",
+    r"\brad\s*/\s*s(ec)?\b": "radps",
+    r"\bm\s*/\s*s(ec)?\s*(\^?2|²)": "mps2",
+    r"\bm\s*/\s*s(ec)?\b": "mps",
+}
 #: Words that mark the uncertainty of a value; fields with these words are ignored.
 _SKIPPED = frozenset(
     (
@@ -59,6 +68,8 @@ _SKIPPED = frozenset(
         "accuracy",
     )
 )
+#: Words of durations, which are no times.
+_OF_DURATION = frozenset(("delta", "dt", "elapsed", "duration", "age"))
 #: Words that mark a velocity, a position, a size, or a vector that is not read.
 _OF_VELOCITY = frozenset(
     ("velocity", "vel", "v", "speed", "twist", "vrel", "vabs", "linear")
@@ -96,7 +107,7 @@ _AXES = {
 _NAMES = {
     "receipt": "receipt|received|receive|recv|seen|arrival|arrived|rx|"
     "(receipt|received|receive|recv|arrival|rx|log|network|sub)_(time|stamp|timestamp)",
-    "stamp": "stamp|timestamp|time|t|epoch|secs?|seconds",
+    "stamp": "stamp|timestamp|datetime|time|t|epoch|secs?|seconds|utc|date",
     "yaw_rate_radps": "yaw_?rate|turn_rate|heading_rate|omega|angular_(velocity_)?z|gyro_z",
     "range_rate_mps": "range_?rate|doppler|rdot|vr|vrel|(radial|doppler|closing|relative|rel|approach)_"
     "(velocity|vel|speed)|(velocity|vel|speed|v)_(radial|doppler|relative|rel)",
@@ -108,8 +119,8 @@ _NAMES = {
     "velocity y": "(vy|dy_dt|vlat)(_rel|_abs)?",
     "latitude_deg": "lat|latitude",
     "longitude_deg": "lon|lng|long|longitude",
-    "x_m": "px|east|easting|e|dx|longitudinal|utm_x",
-    "y_m": "py|north|northing|n|dy|lateral|utm_y",
+    "x_m": "px|tx|east|easting|e|dx|longitudinal|utm_x",
+    "y_m": "py|ty|north|northing|n|dy|lateral|utm_y",
     "length_m": "length|l",
     "width_m": "width|w",
     "height_m": "height|h",
@@ -120,6 +131,14 @@ _NAMES = {
 }
 #: Range of latitudes around 0 from which they are positions in m.
 _LOCAL_DEG = 2.0
+#: Names of the components of a quaternion: a common part, an optional word, and the axis.
+_QUATERNION = re.compile(
+    r"(.*?)(?:q(?:uat(?:ernion)?)?|orientation|rotation|rot)[._ ]?([xyzw])",
+    re.IGNORECASE,
+)
+#: Larger latitudes are integers in 1e-7 degrees, as in messages of vehicles and of autopilots.
+_LARGEST_DEG = 90.0
+_TINY_DEG = 1e-7
 #: Plausible periods of a source.
 _PERIOD_S = (5e-4, 20.0)
 #: Smallest distance of two positions from which a course is computed.
@@ -142,14 +161,11 @@ class Guess:
 
 
 def words_of(name: str) -> list[str]:
-    """Words in the name of a column or in the path of a field, in lower case."""
-    return [
-        word
-        for word in re.split(
-            r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
-        )
-        if word
-    ]
+    """Words in the name of a column or in the path of a field, in lower case; units have one word (`km/h`: `kmh`)."""
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().replace("°", "deg")
+    for pattern, unit in _UNIT_TEXTS.items():
+        text = re.sub(pattern, f" {unit} ", text)
+    return [word for word in re.split(r"[^a-z0-9]+", text) if word]
 
 
 def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
@@ -164,6 +180,11 @@ def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
         if component is not None and component not in guessed:
             guessed[component] = _converted(component, unit, name, samples)
     _without_degrees(guessed, values)
+    _with_tiny_degrees(guessed, values)
+    if (quaternion := _quaternion(values)) is not None and not values.get(
+        _name(guessed["yaw_rad"]) if "yaw_rad" in guessed else ""
+    ):
+        guessed["yaw_rad"] = quaternion
     vx = guessed.pop("velocity x", None)
     vy = guessed.pop("velocity y", None)
     if vx and vy and guessed.keys().isdisjoint(("speed_mps", "range_rate_mps")):
@@ -191,6 +212,32 @@ def _without_degrees(
         guessed["y_m"] = Guess(names[0], reason)
         guessed["x_m"] = Guess(names[1], reason)
         del guessed["latitude_deg"], guessed["longitude_deg"]
+
+
+def _with_tiny_degrees(
+    guessed: dict[str, Guess], values: Mapping[str, Sequence[float]]
+) -> None:
+    """Convert latitude and longitude from 1e-7 degrees if the latitudes do not exist on Earth."""
+    if not {"latitude_deg", "longitude_deg"} <= guessed.keys():
+        return
+    latitudes = values.get(_name(guessed["latitude_deg"]), ())
+    largest = max((abs(each) for each in latitudes if math.isfinite(each)), default=0.0)
+    if _LARGEST_DEG < largest < _LARGEST_DEG / _TINY_DEG:
+        for key in ("latitude_deg", "longitude_deg"):
+            name = _name(guessed[key])
+            guessed[key] = Guess(Field(name, _TINY_DEG), "integers in 1e-7 degrees")
+
+
+def _quaternion(values: Mapping[str, Sequence[float]]) -> Guess | None:
+    """Guess of the heading from four fields of a quaternion; None without such fields."""
+    fields: dict[str, dict[str, str]] = {}
+    for name in values:
+        if match := _QUATERNION.fullmatch(name):
+            fields.setdefault(match[1], {})[match[2].lower()] = name
+    for found in fields.values():
+        if len(found) == 4:
+            return Guess([found[axis] for axis in "xyzw"], "yaw of the quaternion")
+    return None
 
 
 def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
@@ -233,7 +280,7 @@ def agreeing_with_motion(
     if moved.sum() < _FEWEST_STEPS:
         return dict(guessed)
     changed = dict(guessed)
-    if "yaw_rad" in guessed:
+    if "yaw_rad" in guessed and not isinstance(guessed["yaw_rad"].path, list):
         raw = values[_name(guessed["yaw_rad"])][:-1][moved]
         changed["yaw_rad"] = _heading(
             guessed["yaw_rad"], raw, np.arctan2(dy_m, dx_m)[moved]
@@ -279,7 +326,8 @@ def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
 
 def _component(name: str) -> tuple[str | None, str]:
     """Return the component that a field's name stands for (None if it is not read), and the unit in the name."""
-    words = words_of(name)
+    # `pose_with_covariance` is a part of the path to a value, not an uncertainty.
+    words = words_of(re.sub("with_?covariance", "", name, flags=re.IGNORECASE))
     if not words or _SKIPPED & set(words):
         return None, ""
     unit = words[-1] if words[-1] in _UNITS else ""
@@ -305,7 +353,8 @@ def _component(name: str) -> tuple[str | None, str]:
         return None, unit
     for component, names in _NAMES.items():
         if re.fullmatch(f"(?:.*_)?(?:{names})", text):
-            return component, unit
+            is_duration = component == "stamp" and _OF_DURATION & set(base)
+            return None if is_duration else component, unit
     return None, unit
 
 

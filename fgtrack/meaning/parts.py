@@ -11,6 +11,7 @@ from fgtrack.meaning.guess import Guess, words_of
 
 __all__ = [
     "EGO_WORDS",
+    "FULL_EGO",
     "NEEDED",
     "POSITIONS",
     "TRUTH_WORDS",
@@ -56,7 +57,10 @@ POSITIONS = (
     {"bearing_rad"},
     set(GEODETIC),
 )
-NEEDED = {"ego": {"x_m", "y_m", "yaw_rad", "speed_mps"}, "truth": {"x_m", "y_m"}}
+NEEDED = {"ego": {"x_m", "y_m"}, "truth": {"x_m", "y_m"}}
+"""Required components; heading and speed of the ego follow from its positions."""
+FULL_EGO = {"x_m", "y_m", "yaw_rad", "speed_mps"}
+"""Components of an ego that is recognised without its name."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class InputPart:
     """Reason of each guess, by setting or component."""
     notes: tuple[str, ...] = ()
     """Notes on unused fields, and on settings to check."""
+    rank: int = 0
+    """Rank among several parts with one role: the lowest is used."""
 
     @property
     def label(self) -> str:

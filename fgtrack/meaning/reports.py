@@ -8,8 +8,9 @@ from pathlib import Path
 from fgtrack.inputs.formats.tables import headers, rows
 from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.inputs.settings import CsvTable, FieldPath
-from fgtrack.meaning.guess import guesses, time_unit, words_of
+from fgtrack.meaning.guess import guesses, words_of
 from fgtrack.meaning.parts import InputPart
+from fgtrack.meaning.stamps import stamps, with_stamp
 from fgtrack.models.sensors import Filter
 
 __all__ = ["report_part"]
@@ -33,8 +34,11 @@ def report_part(path: Path) -> InputPart | None:
         return None
     [(file, names)] = tables.items()
     cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
-    guessed = guesses(
-        {name: _numbers(each[name] for each in cells) for name in names if name}
+    guessed = with_stamp(
+        guesses(
+            {name: _numbers(each[name] for each in cells) for name in names if name}
+        ),
+        cells,
     )
     known = ("stamp", "receipt", *GEODETIC, "id")
     columns: dict[str, FieldPath] = {
@@ -48,9 +52,7 @@ def report_part(path: Path) -> InputPart | None:
             return None
     if "stamp" not in columns:
         return None
-    unit, _ = time_unit(
-        str(columns["stamp"]), _numbers(each[str(columns["stamp"])] for each in cells)
-    )
+    _, unit, _ = stamps(guessed["stamp"], cells)
     words = set(words_of(str(columns.get("id", ""))))
     sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
     filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}

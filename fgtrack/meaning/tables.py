@@ -9,12 +9,14 @@ import numpy as np
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
+from fgtrack.inputs.formats.fields import paths_of
 from fgtrack.inputs.formats.tables import rows
 from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.inputs.settings import CsvTable
-from fgtrack.meaning.guess import agreeing_with_motion, guesses, time_unit, words_of
+from fgtrack.meaning.guess import agreeing_with_motion, guesses, words_of
 from fgtrack.meaning.parts import (
     EGO_WORDS,
+    FULL_EGO,
     NEEDED,
     POSITIONS,
     TRUTH_WORDS,
@@ -23,11 +25,26 @@ from fgtrack.meaning.parts import (
     spreads,
     unused,
 )
+from fgtrack.meaning.stamps import stamps, with_stamp
 
 __all__ = ["table_part"]
 
 #: Number of rows of a table on which a guess is based.
 _ROWS = 20_000
+#: Words in the name of a table of the ego's poses.
+_EGO_TABLES = frozenset(
+    (
+        "odom",
+        "odometry",
+        "pose",
+        "poses",
+        "trajectory",
+        "traj",
+        "gnss",
+        "gps",
+        "localization",
+    )
+)
 
 
 def table_part(
@@ -52,19 +69,21 @@ def table_part(
     words = set(words_of(file.stem))
     is_truth = bool(words & TRUTH_WORDS and not words & EGO_WORDS)
     is_ego = bool(words & EGO_WORDS)
-    is_ego |= not (is_truth or "object_id" in own) and NEEDED["ego"] <= own.keys()
+    if not (is_truth or "object_id" in own or "id" in own):
+        is_named = bool(words & _EGO_TABLES) and NEEDED["ego"] <= own.keys()
+        is_ego |= is_named or own.keys() >= FULL_EGO
     role = "ego" if is_ego else "truth" if is_truth else sensor_name(file.stem, parts)
+    own = with_stamp(own, cells)
     if "stamp" not in own:
         raise DataError(f"no column of times among {spreads(values)}")
-    column = str(own["stamp"].path)
-    unit, why = time_unit(
-        column, [value for value in values[column] if math.isfinite(value)]
-    )
+    times, unit, why = stamps(own["stamp"], cells)
+    values[paths_of(own["stamp"].path)[0]] = times
     if is_ego:
         own = agreeing_with_motion(
             own, {name: np.array(result) for name, result in values.items()}, unit
         )
-    missing = NEEDED.get(role, set()) - own.keys()
+    have = own.keys() | ({"x_m", "y_m"} if own.keys() >= set(GEODETIC) else set())
+    missing = NEEDED.get(role, set()) - have
     if missing or not any(wanted <= own.keys() for wanted in POSITIONS):
         raise DataError(
             f"no column for {', '.join(sorted(missing)) or 'a position'} among {spreads(values)}"
@@ -73,7 +92,8 @@ def table_part(
     known = (
         "stamp",
         "receipt",
-        *((*MEASURABLE, *GEODETIC, *DESCRIBING) if is_sensor else STATE_NAMES),
+        *GEODETIC,
+        *((*MEASURABLE, *DESCRIBING) if is_sensor else STATE_NAMES),
     )
     used = {
         key: item

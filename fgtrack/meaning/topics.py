@@ -12,6 +12,7 @@ from fgtrack.inputs.formats.fields import fields_of
 from fgtrack.inputs.formats.objects import ODOMETRY
 from fgtrack.inputs.info import OTHER_CLOCK_S, TopicInfo
 from fgtrack.inputs.ros.bag import Bag
+from fgtrack.inputs.ros.ego import EGO_TYPES
 from fgtrack.inputs.settings import TopicInput
 from fgtrack.meaning.guess import guesses, words_of
 from fgtrack.meaning.parts import (
@@ -29,9 +30,23 @@ __all__ = ["topic_part"]
 
 #: Number of messages of a topic on which a guess is based.
 _MESSAGES = 20
+#: Words of poses that are not the ego's.
+_OF_GOALS = frozenset(
+    (
+        "goal",
+        "initialpose",
+        "initial",
+        "clicked",
+        "setpoint",
+        "waypoint",
+        "desired",
+        "simple",
+    )
+)
 _OTHER_PACKAGES = (
     "sensor_msgs",
     "tf2_msgs",
+    "tf/",
     "visualization_msgs",
     "rcl_interfaces",
     "rosgraph_msgs",
@@ -62,6 +77,12 @@ def topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[InputPart]) -> InputP
     if problem is not None or not topic.count:
         raise DataError(problem or "no messages")
     sensor = sensor_name(topic.name, parts)
+    if topic.type in EGO_TYPES and topic.type != ODOMETRY and not is_truth:
+        if words & _OF_GOALS:
+            raise DataError("a pose that is not the ego's")
+        reasons["topic"] = "its poses are taken for the ego's, and give its speed"
+        rank = EGO_TYPES.index(topic.type)
+        return InputPart("ego", item, reasons, rank=rank)
     if topic.type == ODOMETRY or topic.type in ADAPTERS:
         return InputPart(
             "truth" if is_truth else "ego" if topic.type == ODOMETRY else sensor,
@@ -86,10 +107,9 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> InputPar
         if topic.type == type_name
     ]
     result: list[Mapping[str, Any]] = [fields_of(message) for message in messages]
-    lists: dict[str, list[Mapping[str, Any]]] = {}
-    for path, items in chain.from_iterable(each.items() for each in result):
-        if isinstance(items, list):
-            lists.setdefault(path, []).extend(map(fields_of, items))
+    lists = _lists_in(result)
+    for outer, items in list(lists.items()):
+        lists |= {f"{outer}.{path}": one for path, one in _lists_in(items).items()}
     lists[""] = result  # the message itself is tried last
     for path, samples in lists.items():
         values = _columns(samples)
@@ -125,6 +145,17 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> InputPar
             "ego" if is_ego else sensor, replace(item, fields=fields), reasons, notes
         )
     raise DataError(f"no position among {spreads(_columns(lists[''])) or 'its fields'}")
+
+
+def _lists_in(
+    samples: Sequence[Mapping[str, Any]],
+) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the fields of the objects in all lists of `samples`, by the path of the list."""
+    lists: dict[str, list[Mapping[str, Any]]] = {}
+    for path, items in chain.from_iterable(each.items() for each in samples):
+        if isinstance(items, list):
+            lists.setdefault(path, []).extend(map(fields_of, items))
+    return lists
 
 
 def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:

@@ -1,7 +1,7 @@
 """Mapped fields: values of messages and tables, read at the paths in the configuration."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -174,14 +174,30 @@ def objects_by_fields(
 def items_by_fields(
     message: RosMessage, fields: Mapping[str, FieldPath]
 ) -> list[RosMessage]:
-    """Recorded objects of `message`, in the order of `objects_by_fields`."""
+    """Recorded objects of `message`, in the order of `objects_by_fields`.
+
+    The path of the objects may lead through lists; then the objects of all their items
+    are returned.
+    """
     if "objects" not in fields:
         return [message]
     path = single_path(fields["objects"])
-    items = value_at(message, path)
-    if not isinstance(items, list | tuple):
+    items = _items_at(message, path.split("."))
+    if items is None:
         raise FieldError(f"{path}: is not a list of objects")
-    return list(items)
+    return items
+
+
+def _items_at(message: RosMessage, parts: Sequence[str]) -> list[RosMessage] | None:
+    """Items of the list at the path `parts`, and of all lists on the way; None without a list at its end."""
+    value = message
+    for number, part in enumerate(parts):
+        value = value_at(value, part)
+        rest = parts[number + 1 :]
+        if isinstance(value, list | tuple) and rest and not rest[0].isdigit():
+            found = [_items_at(item, rest) for item in value]
+            return [each for items in found for each in items or ()]
+    return list(value) if isinstance(value, list | tuple) else None
 
 
 def ego_by_fields(

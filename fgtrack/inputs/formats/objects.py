@@ -89,7 +89,7 @@ def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
 
 
 def autoware_objects(message: RosMessage) -> ObjectList:
-    """Object list of Autoware's `DetectedObjects` or `TrackedObjects`, in either message package.
+    """Object list of Autoware's detected, tracked or predicted objects, in either message package.
 
     Position; yaw if its sign is certain; speed if there is a twist, which is in the
     object's own frame.
@@ -98,13 +98,21 @@ def autoware_objects(message: RosMessage) -> ObjectList:
 
 
 def _autoware_object(item: RosMessage) -> Detection:
-    """Detection from a detected object, which may lack twist and covariances, or from a tracked object with an id."""
+    """Detection from a detected object, which may lack twist and covariances, or from an object with an id.
+
+    A predicted object has an initial pose and twist, and always an orientation.
+    """
     kinematics = item.kinematics
     has_twist = getattr(kinematics, "has_twist", True)
-    pose = kinematics.pose_with_covariance.pose
-    twist = kinematics.twist_with_covariance
+    is_predicted = hasattr(kinematics, "initial_pose_with_covariance")
+    start = "initial_" if is_predicted else ""
+    posed = getattr(kinematics, f"{start}pose_with_covariance")
+    pose = posed.pose
+    twist = getattr(kinematics, f"{start}twist_with_covariance")
     velocity = twist.twist.linear
-    available = kinematics.orientation_availability == _ORIENTATION_AVAILABLE
+    available = is_predicted or (
+        kinematics.orientation_availability == _ORIENTATION_AVAILABLE
+    )
     values = {
         "x_m": pose.position.x,
         "y_m": pose.position.y,
@@ -118,7 +126,7 @@ def _autoware_object(item: RosMessage) -> Detection:
     pose_covariance = None
     has_twist_covariance = getattr(kinematics, "has_twist_covariance", True)
     if getattr(kinematics, "has_position_covariance", True):
-        pose_covariance = planar(kinematics.pose_with_covariance.covariance)
+        pose_covariance = planar(posed.covariance)
     label = (
         max(item.classification, key=lambda each: each.probability).label
         if len(item.classification)

@@ -22,6 +22,13 @@ _AUTOWARE = {
     "TrackedObject": "unique_identifier_msgs/UUID object_id, float32 existence_probability, "
     "ObjectClassification[] classification, TrackedObjectKinematics kinematics, Shape shape",
     "TrackedObjects": "std_msgs/Header header, TrackedObject[] objects",
+    "PredictedPath": "geometry_msgs/Pose[] path, builtin_interfaces/Duration time_step, float32 confidence",
+    "PredictedObjectKinematics": "geometry_msgs/PoseWithCovariance initial_pose_with_covariance, "
+    "geometry_msgs/TwistWithCovariance initial_twist_with_covariance, "
+    "geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance, PredictedPath[] predicted_paths",
+    "PredictedObject": "unique_identifier_msgs/UUID object_id, float32 existence_probability, "
+    "ObjectClassification[] classification, PredictedObjectKinematics kinematics, Shape shape",
+    "PredictedObjects": "std_msgs/Header header, PredictedObject[] objects",
 }
 _FOREIGN = {
     **{

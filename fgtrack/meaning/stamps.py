@@ -1,0 +1,84 @@
+"""Columns of the times of a table: numbers since 1970, dates, times of day, a date and a time in two columns."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.inputs.formats.fields import paths_of
+from fgtrack.inputs.formats.table_times import Cells
+from fgtrack.inputs.formats.time_texts import TimeForm, form_of
+from fgtrack.inputs.settings import FieldPath
+from fgtrack.meaning.guess import Guess, time_unit, words_of
+
+__all__ = ["stamps", "with_stamp"]
+
+#: Number of rows from which the form of dates is inferred.
+_ROWS = 1000
+_DATE_WORDS = frozenset(("date", "day", "datum"))
+
+
+def with_stamp(own: Mapping[str, Guess], cells: Sequence[Cells]) -> dict[str, Guess]:
+    """Return the guesses `own` of a table with the rows `cells`, completed by a stamp.
+
+    Without a stamp, the receipt is the stamp. A time of day gets the column of dates
+    beside it.
+    """
+    result = dict(own)
+    if "stamp" not in own and "receipt" in own:
+        only = result.pop("receipt")
+        result["stamp"] = replace(only, reason="the only column of times")
+    if "stamp" not in result or not cells:
+        return result
+    names = [name for name in cells[0] if name]
+    dates = [name for name in names if _DATE_WORDS & set(words_of(name))]
+    clocks = [name for name in names if words_of(name)[-1:] == ["time"]]
+    known = _form(cells, result["stamp"].path)
+    is_number = known is None and _is_number(cells[0], result["stamp"].path)
+    if is_number or (known is not None and not known.is_of_day):
+        return result
+    for date, clock in ((date, clock) for date in dates for clock in clocks):
+        columns = [date, clock]
+        if date != clock and _form(cells, columns) is not None:
+            result["stamp"] = Guess(columns, "date and time of day")
+            return result
+    return result
+
+
+def stamps(guess: Guess, cells: Sequence[Cells]) -> tuple[list[float], str, str]:
+    """Return the times in the rows, NaN for others, their unit, and the reason for the unit."""
+    texts = [_joined(row, guess.path) for row in cells]
+    form = _form(cells, guess.path)
+    if form is not None:
+        reason = "times of day" if form.is_of_day else "dates and times"
+        return [_seconds(form, text) for text in texts], "s", reason
+    numbers = [_number(text.split(" ")[0]) for text in texts]
+    finite = [value for value in numbers if math.isfinite(value)]
+    unit, reason = time_unit(paths_of(guess.path)[0], finite)
+    return numbers, unit, reason
+
+
+def _form(cells: Sequence[Cells], path: FieldPath) -> TimeForm | None:
+    return form_of(_joined(row, path) for row in cells[:_ROWS])
+
+
+def _joined(row: Cells, path: FieldPath) -> str:
+    return " ".join(row[name] for name in paths_of(path))
+
+
+def _is_number(row: Cells, path: FieldPath) -> bool:
+    return math.isfinite(_number(_joined(row, path).split(" ")[0]))
+
+
+def _seconds(form: TimeForm, text: str) -> float:
+    try:
+        return form.time_ns(text) / NS_PER_S
+    except (ValueError, ArithmeticError):
+        return math.nan
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
