@@ -133,7 +133,7 @@ _NAMES = {
 _LOCAL_DEG = 2.0
 #: Names of the components of a quaternion: a common part, an optional word, and the axis.
 _QUATERNION = re.compile(
-    r"(.*?)(?:q(?:uat(?:ernion)?)?|orientation|rotation|rot)[._ ]?([xyzw])",
+    r"(.*?)(?:q(?:uat(?:ernion)?)?|orientation|rotation|rot)[._ /]?([xyzw])",
     re.IGNORECASE,
 )
 #: Larger latitudes are integers in 1e-7 degrees, as in messages of vehicles and of autopilots.
@@ -285,18 +285,28 @@ def agreeing_with_motion(
         changed["yaw_rad"] = _heading(
             guessed["yaw_rad"], raw, np.arctan2(dy_m, dx_m)[moved]
         )
-    if "speed_mps" in guessed and isinstance(guessed["speed_mps"].path, str):
-        ratio = float(
-            np.median(values[_name(guessed["speed_mps"])][:-1][moved])
-            / np.median(step_m[moved] / gap_s[moved])
+    if "speed_mps" in guessed:
+        changed["speed_mps"] = _speed(
+            guessed["speed_mps"],
+            values[_name(guessed["speed_mps"])][:-1][moved],
+            step_m[moved] / gap_s[moved],
         )
-        for name, scale in _SPEED_SCALES.items():
-            if abs(ratio * scale - 1.0) < _SPEED_TOLERANCE and scale != 1.0:
-                reason = f"{ratio:.3g} times the distance travelled per second: {name}"
-                changed["speed_mps"] = Guess(
-                    Field(_name(guessed["speed_mps"]), scale), reason
-                )
     return changed
+
+
+def _speed(guess: Guess, raw: FloatArray, step_mps: FloatArray) -> Guess:
+    """Guess of the speed in the unit that agrees with the distance travelled; `guess` if it agrees, or none does."""
+    path = guess.path if isinstance(guess.path, Field) else Field(guess.path)
+    if not isinstance(path.path, str):
+        return guess
+    ratio = float(np.median(raw) / np.median(step_mps))
+    if abs(ratio * path.scale - 1.0) < _SPEED_TOLERANCE:
+        return guess
+    for name, scale in _SPEED_SCALES.items():
+        if abs(ratio * scale - 1.0) < _SPEED_TOLERANCE:
+            reason = f"{ratio:.3g} times the distance travelled per second: {name}"
+            return Guess(path.path if scale == 1.0 else Field(path.path, scale), reason)
+    return guess
 
 
 def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:

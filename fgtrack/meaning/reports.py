@@ -18,6 +18,7 @@ __all__ = ["report_part"]
 #: Number of rows on which the guess of the columns is based.
 _SAMPLES = 200
 _IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
+_OF_AIRCRAFT = frozenset(("icao", "icao24", "hex", "address"))
 #: Column of Flightradar24's granular ADS-B data: P for a message with a position, N for a repeated position.
 _HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 
@@ -54,7 +55,7 @@ def report_part(path: Path) -> InputPart | None:
         return None
     _, unit, _ = stamps(guessed["stamp"], cells)
     words = set(words_of(str(columns.get("id", ""))))
-    sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
+    sensor = "ais" if "mmsi" in words else "adsb" if words & _OF_AIRCRAFT else "reports"
     filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
     name = file.name if path.is_dir() else None
     table = CsvTable(columns, name, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT

@@ -22,27 +22,35 @@ def with_stamp(own: Mapping[str, Guess], cells: Sequence[Cells]) -> dict[str, Gu
     """Return the guesses `own` of a table with the rows `cells`, completed by a stamp.
 
     Without a stamp, the receipt is the stamp. A time of day gets the column of dates
-    beside it.
+    with the same words, or else the first one.
     """
     result = dict(own)
     if "stamp" not in own and "receipt" in own:
         only = result.pop("receipt")
         result["stamp"] = replace(only, reason="the only column of times")
-    if "stamp" not in result or not cells:
-        return result
+    for key in ("stamp", "receipt"):
+        if key in result and cells:
+            result[key] = _with_date(result[key], cells)
+    return result
+
+
+def _with_date(guess: Guess, cells: Sequence[Cells]) -> Guess:
+    """Return the guess of a time with the column of dates beside it, if it needs one."""
+    form = _form(cells, guess.path)
+    if form.date is not None if form else _is_number(cells[0], guess.path):
+        return guess
+    own = paths_of(guess.path)[0]
     names = [name for name in cells[0] if name]
     dates = [name for name in names if _DATE_WORDS & set(words_of(name))]
-    clocks = [name for name in names if words_of(name)[-1:] == ["time"]]
-    known = _form(cells, result["stamp"].path)
-    is_number = known is None and _is_number(cells[0], result["stamp"].path)
-    if is_number or (known is not None and not known.is_of_day):
-        return result
-    for date, clock in ((date, clock) for date in dates for clock in clocks):
-        columns = [date, clock]
-        if date != clock and _form(cells, columns) is not None:
-            result["stamp"] = Guess(columns, "date and time of day")
-            return result
-    return result
+    clocks = (
+        [own] if form else [each for each in names if words_of(each)[-1:] == ["time"]]
+    )
+    context = set(words_of(own))
+    dates.sort(key=lambda name: not context & (set(words_of(name)) - _DATE_WORDS))
+    for columns in ([date, clock] for date in dates for clock in clocks):
+        if columns[0] != columns[1] and _form(cells, columns) is not None:
+            return Guess(columns, "date and time of day")
+    return guess
 
 
 def stamps(guess: Guess, cells: Sequence[Cells]) -> tuple[list[float], str, str]:

@@ -25,6 +25,25 @@ from fgtrack.meaning.guess import agreeing_with_motion, guesses, time_unit
         ("bearing_deg", [-1.0, 1.0], "bearing_rad", Field("bearing_deg", degrees=True)),
         ("speed_kmh", [50.0], "speed_mps", Field("speed_kmh", 1.0 / 3.6)),
         ("kmh", [50.0], "speed_mps", Field("kmh", 1.0 / 3.6)),
+        ("Speed [km/h]", [50.0], "speed_mps", Field("Speed [km/h]", 1.0 / 3.6)),
+        ("Speed (m/s)", [50.0], "speed_mps", "Speed (m/s)"),
+        ("v [mi/h]", [50.0], "speed_mps", Field("v [mi/h]", 0.44704)),
+        ("Heading [°]", [5.0], "yaw_rad", Field("Heading [°]", degrees=True)),
+        (
+            "yaw rate [deg/s]",
+            [1.0],
+            "yaw_rate_radps",
+            Field("yaw rate [deg/s]", degrees=True),
+        ),
+        ("tx_m", [1.0], "x_m", "tx_m"),
+        (
+            "kinematics.pose_with_covariance.pose.position.x",
+            [1.0],
+            "x_m",
+            "kinematics.pose_with_covariance.pose.position.x",
+        ),
+        ("generationDeltaTime", [1.0], None, None),
+        ("pose_covariance", [1.0], None, None),
         ("rangeRate", [1.0], "range_rate_mps", "rangeRate"),
         ("yaw_rate_deg", [1.0], "yaw_rate_radps", Field("yaw_rate_deg", degrees=True)),
         ("dimensions.x", [4.0], "length_m", "dimensions.x"),
@@ -124,3 +143,62 @@ def test_a_heading_and_a_speed_are_those_with_which_the_positions_move(
     )
     strange = agreeing_with_motion(found, {**values, "heading": -2.0 * heading}, "ms")
     assert "check it" in strange["yaw_rad"].reason
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("qx", "qy", "qz", "qw"),
+        ("q_x", "q_y", "q_z", "q_w"),
+        (
+            "pose.orientation.x",
+            "pose.orientation.y",
+            "pose.orientation.z",
+            "pose.orientation.w",
+        ),
+        ("Rotation_X", "Rotation_Y", "Rotation_Z", "Rotation_W"),
+        (
+            "/odom/pose/orientation/x",
+            "/odom/pose/orientation/y",
+            "/odom/pose/orientation/z",
+            "/odom/pose/orientation/w",
+        ),
+        ("quat_x", "quat_y", "quat_z", "quat_w"),
+    ],
+)
+def test_four_fields_of_a_quaternion_are_the_heading(names):
+    found = guesses({name: [0.1, 0.2] for name in (names[3], *names[:3])})
+    assert found["yaw_rad"].path == list(names)
+    assert "yaw_rad" not in guesses({name: [0.1] for name in names[:3]})
+    assert (
+        guesses({"yaw": [0.1], **{name: [0.1] for name in names}})["yaw_rad"].path
+        == "yaw"
+    )
+
+
+def test_integers_in_tiny_degrees_are_positions():
+    found = guesses({"latitude": [480000000.0], "longitude": [1000.0]})
+    assert found["latitude_deg"].path == Field("latitude", 1e-7)
+    assert found["longitude_deg"].path == Field("longitude", 1e-7)
+    usual = guesses({"latitude": [48.0], "longitude": [11.0]})
+    assert usual["latitude_deg"].path == "latitude"
+
+
+@pytest.mark.parametrize("named", ["mps", "kmh", "knots"])
+@pytest.mark.parametrize(
+    ("true", "scale"), [("mps", 1.0), ("kmh", 3.6), ("mph", 2.23694)]
+)
+def test_the_distance_travelled_decides_the_unit_of_the_speed(named, true, scale):
+    t = np.arange(0.0, 20.0, 0.1)
+    speed = 10.0 + np.sin(t)
+    name = f"speed_{named}"
+    values = {
+        "t": t,
+        "x": np.cumsum(speed) * 0.1,
+        "y": np.zeros(200),
+        name: scale * speed,
+    }
+    own = guesses({key: each.tolist() for key, each in values.items()})
+    found = agreeing_with_motion(own, values, "s")["speed_mps"].path
+    factor = found.scale if isinstance(found, Field) else 1.0
+    assert factor * scale == pytest.approx(1.0, rel=0.01), true

@@ -29,6 +29,17 @@ _WITH_COMMA = re.compile(
 #: Columns of a trajectory in the layout of TUM, which has no header.
 _TRAJECTORY = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT_NORM = 1e-2
+#: Smallest table that is recognised by its content.
+_FEWEST_ROWS = 3
+_FEWEST_COLUMNS = 3
+#: Columns of the messages of ADS-B receivers in the format of BaseStation (SBS), and kinds of messages.
+_SBS = (
+    *("message", "transmission", "session", "aircraft", "hex", "flight"),
+    *("generated_date", "generated_time", "log_date", "log_time", "callsign"),
+    *("altitude_ft", "ground_speed_kn", "track_deg", "latitude", "longitude"),
+    *("climb_ft_per_min", "squawk", "alert", "emergency", "spi", "is_on_ground"),
+)
+_SBS_KINDS = frozenset(("MSG", "SEL", "ID", "AIR", "STA", "CLK"))
 
 
 @dataclass(frozen=True)
@@ -125,7 +136,8 @@ def text_form(lines: Sequence[str], delimiter: str | None, where: str) -> TableT
         return TableText(separator, tuple(named), first, has_comma)
     if first == len(lines):
         return TableText(separator, tuple(named), first, has_comma)
-    if any(samples[0]) and all(map(_is_value, samples[0])):
+    present = [cell for cell in samples[0] if cell]
+    if present and 2 * sum(map(_is_value, present)) >= len(present):
         return TableText(separator, _names_of(samples, where), first, has_comma)
     return TableText(separator, tuple(samples[0]), first + 1, has_comma)
 
@@ -136,6 +148,21 @@ def _without_end(cells: Sequence[str], size: int) -> Sequence[str]:
     while end > size and not cells[end - 1]:
         end -= 1
     return cells[:end]
+
+
+def is_table(lines: Sequence[str]) -> bool:
+    """True if `lines` have the form of a table of numbers: rows of equal length, mostly numbers or times."""
+    try:
+        form = text_form(lines, None, "")
+        rows = [cells for _, cells in islice(form.cells(lines), _ROWS)]
+    except (DataError, csv.Error):
+        return False
+    rows = rows[:-1] if len(rows) == _ROWS else rows
+    if len(rows) < _FEWEST_ROWS or len(form.header) < _FEWEST_COLUMNS:
+        return False
+    first = [cell for cell in rows[0] if cell]
+    num_values = sum(map(_is_value, first))
+    return all(len(row) == len(rows[0]) for row in rows) and 2 * num_values > len(first)
 
 
 def _with_point(cell: str) -> str:
@@ -163,11 +190,16 @@ def _is_value(cell: str) -> bool:
 
 def _names_of(rows: Sequence[Sequence[str]], where: str) -> tuple[str, ...]:
     """Names of the columns of a known layout without a header; raises `DataError` for another table."""
-    if all(len(row) == len(_TRAJECTORY) for row in rows):
+    if all(len(row) == len(_SBS) and row[0] in _SBS_KINDS for row in rows):
+        return _SBS
+    is_numeric = all(
+        _NUMBER.fullmatch(_with_point(cell)) for row in rows for cell in row
+    )
+    if is_numeric and all(len(row) == len(_TRAJECTORY) for row in rows):
         norms = [sum(float(_with_point(each)) ** 2 for each in row[4:]) for row in rows]
         if all(abs(norm - 1.0) < _UNIT_NORM for norm in norms):
             return _TRAJECTORY
     raise DataError(
-        f"{where}: has no header, its first line contains only values: write the names of the "
+        f"{where}: has no header, its first line contains values: write the names of the "
         f"{len(rows[0])} columns into a first line, for example time,x,y"
     )

@@ -41,7 +41,7 @@ from fgtrack.inputs.formats.fields import (
     paths_of,
 )
 from fgtrack.inputs.formats.fusiontracking import LOG_NAME
-from fgtrack.inputs.formats.table_text import encoding_of, text_form
+from fgtrack.inputs.formats.table_text import encoding_of, is_table, text_form
 from fgtrack.inputs.formats.table_times import (
     TIMES,
     Cells,
@@ -56,6 +56,9 @@ from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
 
 _ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
+#: Endings of other texts, which are tables if their content is one, and the largest number of them in a folder.
+_TEXT_ENDINGS = (".txt", ".dat", ".asc", ".tum")
+_MOST_TEXTS = 50
 #: Rows from which the form of dates is inferred.
 _SAMPLES = 1000
 #: Bytes from which the form of the text is inferred.
@@ -294,11 +297,27 @@ def _values(
 
 def _recognises(path: Path) -> bool:
     if path.is_dir():
-        return not (path / "meta.json").exists() and any(
-            file.name.endswith(_ENDINGS) for file in path.iterdir()
-        )
+        return not (path / "meta.json").exists() and bool(_files(path))
     # A FusionTracking log is read as a folder.
-    return path.name.endswith(_ENDINGS) and path.name != LOG_NAME
+    return bool(_files(path)) and path.name != LOG_NAME
+
+
+def _files(path: Path) -> list[Path]:
+    """Tables at `path`: the file, or those in the folder, by the ending of the name or by their content."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    usual = [file for file in files if file.name.endswith(_ENDINGS)]
+    others = [file for file in files if file.suffix in _TEXT_ENDINGS and file.is_file()]
+    if len(others) > _MOST_TEXTS:
+        return usual
+    return sorted(usual + [file for file in others if is_table(_first_lines(file))])
+
+
+def _first_lines(file: Path) -> list[str]:
+    with open_file(file) as raw:
+        sample = raw.read(_SAMPLE_BYTES)
+    text = sample.decode(encoding_of(sample), "replace")
+    lines = list(StringIO(text, newline=""))
+    return [] if "\0" in text else lines[: -1 if len(sample) == _SAMPLE_BYTES else None]
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
@@ -328,12 +347,7 @@ def headers(path: Path) -> dict[Path, list[str]]:
 
     Raises `DataError` as `rows`.
     """
-    files = (
-        sorted(file for file in path.iterdir() if file.name.endswith(_ENDINGS))
-        if path.is_dir()
-        else [path]
-    )
-    return {file: list(next(rows(file))[1]) for file in files}
+    return {file: list(next(rows(file))[1]) for file in _files(path)}
 
 
 def _file(path: Path, table: CsvTable, role: str) -> Path:
