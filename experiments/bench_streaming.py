@@ -24,7 +24,12 @@ JUDGED = {
     "ready": "when ready [m]",
     "predicted": "predicted to then [m]",
 }
-_MARKS = {"best": " (best)", "tie": " (tie)", "worse": ""}
+_MARKS = {
+    "best": " (best)",
+    "tie": " (tie)",
+    "unresolved": " (not resolved)",
+    "worse": "",
+}
 
 
 def streams(

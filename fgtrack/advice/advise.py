@@ -501,6 +501,7 @@ class Adviser:
 _REPORTED_BY = {
     "use": ("track", "clock", "input", "question"),
     "births": ("track",),
+    "breaks": ("track",),
     "truth": (),
     "positions against speed": (),
 }

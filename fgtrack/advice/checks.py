@@ -18,6 +18,8 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.diagnostics import (
     FAILED_SHARE,
     FAR_OFF,
+    MOST_BREAKS_PER_MINUTE,
+    USED,
     lifetimes_and_breaks,
 )
 from fgtrack.evaluation.diagnostics import FEWEST as FEWEST_UPDATES
@@ -32,6 +34,8 @@ TRACKS = "tracks"
 MOST_DEAD = 0.1
 """Largest share of the used detections that start a track which is never confirmed, for a verdict of fine."""
 _LEAST_USED = 0.5
+# Least tracked share of the time in view, for a verdict of fine.
+_LEAST_TRACKED = 0.9
 # Weight of a finding that makes other results of the same sensor doubtful.
 _DOUBTFUL = 50.0
 # Largest relative difference of the way of the ego's positions from the way of its speed.
@@ -215,6 +219,8 @@ def _clock(evidence: Evidence, name: str, one: Arrivals) -> Check | None:
             "untested",
             "no object is tracked well enough, or a finding forbids it",
         )
+    if name == report.reference and len(report.sensors) == 1:
+        return Check(name, "clock", "untested", "no truth, and no second sensor")
     if name == report.reference:
         return Check(
             name,
@@ -267,13 +273,23 @@ def _use(evidence: Evidence, name: str, one: Arrivals) -> Check | None:
         return Check(name, "use", "untested", "no detections in the replayed part")
     used = outcome.used.get(name, 0.0)
     failed = counts.get("failed", 0) / total
+    rest = {
+        fate: count
+        for fate, count in counts.items()
+        if fate not in (*USED, "failed") and count
+    }
+    most = max(rest, key=rest.__getitem__, default=None)
+    unused = "" if most is None else f", {percent(rest[most] / total)} {most}"
     is_fine = (
         used >= _LEAST_USED
         and failed <= FAILED_SHARE
         and not evidence.has("track", name)
     )
-    text = f"{percent(used)} of {total} detections used, {percent(failed)} failed"
-    return Check(name, "use", _verdict(is_fine), text)
+    text = (
+        f"{percent(used)} of {total} detections used (limit {percent(_LEAST_USED)}){unused}, {percent(failed)} failed "
+        f"(limit {percent(FAILED_SHARE)})"
+    )
+    return _unless(evidence.doubt(name), Check(name, "use", _verdict(is_fine), text))
 
 
 def _noise(evidence: Evidence, name: str, one: Arrivals) -> Check | None:
@@ -356,9 +372,12 @@ def _tracks(evidence: Evidence) -> Iterator[Check]:
         f"{percent(MOST_DEAD)})"
     )
     yield _unless(doubt, Check(TRACKS, "births", _verdict(is_fine), text))
-    _, breaks = lifetimes_and_breaks(outcome.run)
-    text = f"{breaks} of {outcome.confirmed} confirmed tracks begin where another one has just ended"
-    yield _unless(doubt, Check(TRACKS, "breaks", _verdict(not is_found), text))
+    breaks, rate = _breaks(outcome)
+    text = (
+        f"{breaks}, {rate:.2g} per object and minute (limit {MOST_BREAKS_PER_MINUTE:g})"
+    )
+    is_fine = not is_found and rate <= MOST_BREAKS_PER_MINUTE
+    yield _unless(doubt, Check(TRACKS, "breaks", _verdict(is_fine), text))
     if outcome.truth is None:
         yield Check(
             TRACKS,
@@ -369,12 +388,18 @@ def _tracks(evidence: Evidence) -> Iterator[Check]:
     else:
         truth = outcome.truth
         rmse_m = truth.errors["position_m"].rmse
-        text = f"{percent(truth.tracked_share_in_view)} of the time in view tracked, position RMSE {rmse_m:.3g} m"
+        share = percent(truth.tracked_share_in_view)
+        text = f"{share} of the time in view tracked (limit {percent(_LEAST_TRACKED)}), position RMSE {rmse_m:.3g} m"
         is_fine = truth.tracked_share_in_view >= _LEAST_TRACKED and not is_found
         yield _unless(doubt, Check(TRACKS, "truth", _verdict(is_fine), text))
 
 
-_LEAST_TRACKED = 0.9
+def _breaks(outcome: RunQuality) -> tuple[int, float]:
+    """Return the number of breaks, and their rate per object and minute; without truth from the tracks alone."""
+    if outcome.truth is not None:
+        return outcome.truth.breaks, outcome.breaks_per_minute
+    lifetimes_s, breaks = lifetimes_and_breaks(outcome.run)
+    return breaks, breaks / max(float(lifetimes_s.sum()) / 60.0, 1.0)
 
 
 def _unless(doubt: str | None, check: Check) -> Check:

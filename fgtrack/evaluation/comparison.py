@@ -24,10 +24,15 @@ from fgtrack.evaluation.tables import Column, Value, short, two_digits
 POSITION_NEES = "position_nees"
 """Name of the position NEES. A value near 2 is best."""
 
-STANDING_NOTE = "+: best; =: not resolved from the best, 0 is in the interval"
+STANDING_NOTE = "+: best; ~: not resolved from the best, 0 is in the interval; =: equal up to rounding"
 """Explanation of the marks of `entry_columns`, for a comparison within one run."""
 
-_MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
+_MARKS: Mapping[Value, str] = {
+    "best": "+",
+    "unresolved": "~",
+    "tie": "=",
+    "worse": " ",
+}
 _ERRORS = {
     "position_rmse_m": "position_m",
     "speed_rmse_mps": "speed_mps",
@@ -35,6 +40,9 @@ _ERRORS = {
 }
 NEGLIGIBLE = 1e-6
 """A difference below this share of the cost is rounding."""
+
+
+Standing = Literal["best", "unresolved", "tie", "worse"]
 
 
 @dataclass(frozen=True)
@@ -47,11 +55,12 @@ class Entry:
     """Value of the quantity."""
     worse_by: Estimate | None
     """Cost difference to the best entry; None for the best entry itself."""
-    standing: Literal["best", "tie", "worse"]
-    """Rank: `best`, `tie` or `worse`.
+    standing: Standing
+    """Rank: `best`, `unresolved`, `tie` or `worse`.
 
-    `tie`: the interval of the difference contains 0, or the difference is rounding. The
-    best entry is `best` only if no other entry is a tie.
+    `unresolved`: the interval of the difference contains 0, or is not known, although
+    the means differ. `tie`: the whole interval is rounding. The first entry is `best`
+    only if all others are worse.
     """
 
 
@@ -103,16 +112,22 @@ def ranked(
     best, *others = np.argsort(costs, kind="stable").tolist()
     differences = {k: worse_by(k, best) for k in others}
     rounding = NEGLIGIBLE * float(np.max(costs))
-    worse = {k: d.is_significant and d.high > rounding for k, d in differences.items()}
+    standings: dict[int, Standing] = {}
+    for k, d in differences.items():
+        if max(abs(d.low), abs(d.high)) <= rounding:
+            standings[k] = "tie"
+        else:
+            is_worse = d.is_significant and d.high > rounding
+            standings[k] = "worse" if is_worse else "unresolved"
+    first: Standing = "best"
+    if "unresolved" in standings.values():
+        first = "unresolved"
+    elif "tie" in standings.values():
+        first = "tie"
     return (
-        Entry(
-            names[best],
-            float(values[best]),
-            None,
-            "best" if all(worse.values()) else "tie",
-        ),
+        Entry(names[best], float(values[best]), None, first),
         *(
-            Entry(names[k], float(values[k]), d, "worse" if worse[k] else "tie")
+            Entry(names[k], float(values[k]), d, standings[k])
             for k, d in differences.items()
         ),
     )

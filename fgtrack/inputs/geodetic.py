@@ -21,6 +21,9 @@ from fgtrack.inputs.settings import Origin
 GEODETIC = ("latitude_deg", "longitude_deg")
 """Names of the mapped fields from which x_m and y_m in the map are computed."""
 _FAR_M = 100e3
+# Fewer far positions, or a smaller share of them, are outliers.
+_FEWEST_FAR = 10
+_FAR_SHARE = 0.05
 #: Fixed-point iterations of the height; each one reduces the error by the factor d^2 / (2 R^2).
 _ITERATIONS = 4
 _logger = logging.getLogger(__name__)
@@ -40,7 +43,8 @@ class LocalPlane:
 
     def __init__(self, origin: Origin | None = None) -> None:
         self.origin = origin
-        self._warned = False
+        self._num_near = 0
+        self._num_far = 0
 
     @property
     def origin_deg(self) -> tuple[float, float] | None:
@@ -81,12 +85,16 @@ class LocalPlane:
         x_m, y_m, up_m = map(
             float, geodetic2enu(latitude_deg, longitude_deg, 0.0, *at, 0.0)
         )
-        if not self._warned and (far_m := math.hypot(x_m, y_m, up_m)) > _FAR_M:
-            self._warned = True
-            where = f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}"
-            warn_once(
-                f"a position is {where}: set `input.origin` within 100 km of the positions"
-            )
+        far_m = math.hypot(x_m, y_m, up_m)
+        if far_m <= _FAR_M:
+            self._num_near += 1
+        else:
+            self._num_far += 1
+            if self._num_far >= max(_FEWEST_FAR, _FAR_SHARE * self._num_near):
+                where = f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}"
+                warn_once(
+                    f"positions are {where}: set `input.origin` within 100 km of the positions"
+                )
         return (x_m, y_m) if abs(up_m) < _EARTH_M else (math.nan, math.nan)
 
 

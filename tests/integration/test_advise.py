@@ -127,11 +127,11 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     for passed in (
         "Fine, lidar: stamps: 0 of 150 after their receipt",
         "m left of lidar (± 0.2 m, 150 pairs; limit 1.",
-        "use: 100 % of 150 detections used, 0.0 % failed",
+        "use: 100 % of 150 detections used (limit 50 %), 0.0 % failed (limit 5.0 %)",
         "noise: mean NIS is ",
         "window: 0 of 150 detections later than filter.storage_s allows (3 s)",
         "births: 0 of 300 used detections began a track that was never confirmed (0.0 %, limit 10 %)",
-        "truth: 99 % of the time in view tracked, position RMSE ",
+        "truth: 99 % of the time in view tracked (limit 90 %), position RMSE ",
     ):
         assert passed in text, passed
     assert "Not tested, radar: clock: +25 ms" in text

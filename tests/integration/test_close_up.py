@@ -127,6 +127,25 @@ def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(
         fgtrack.plot.close_up(runs[:1], found)
 
 
+def test_without_truth_no_run_is_judged(folder: Path, found: list[CloseUp]) -> None:
+    runs = [fgtrack.load_run(folder / "runs" / name) for name in NAMES]
+    blind = [
+        run.with_tables(truth=run.tables["truth"].where(slice(0, 0))) for run in runs
+    ]
+    figure = fgtrack.plot.close_up(blind, found)
+    assert faults(figure) == []
+    title = figure.get_suptitle().replace("\n", " ")
+    assert "nearer to the centre is better" not in title
+    assert (
+        f"without truth the centre is {NAMES[0]} afterwards, so no run is judged"
+        in title
+    )
+    assert (
+        "nearer to the centre is better"
+        in fgtrack.plot.close_up(runs, found).get_suptitle()
+    )
+
+
 def test_the_command_refuses_times_that_are_not_and_goes_on_without_a_recording(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -75,13 +75,24 @@ def test_a_difference_of_rounding_is_a_tie_however_certain(
     )
 
 
+def test_a_worse_mean_within_the_interval_is_not_resolved_and_no_tie() -> None:
+    wide = Estimate(0.02, -0.01, 0.05, 40)
+    found = ranked(["a", "aged"], [0.30, 0.32], [0.30, 0.32], lambda one, other: wide)
+    assert [entry.standing for entry in found] == ["unresolved", "unresolved"]
+    unknown = Estimate(0.02, math.nan, math.nan, 1)
+    found = ranked(
+        ["a", "aged"], [0.30, 0.32], [0.30, 0.32], lambda one, other: unknown
+    )
+    assert [entry.standing for entry in found] == ["unresolved", "unresolved"]
+
+
 def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_are(
     trio: list[Run],
 ) -> None:
     found = comparison_of(trio).quantities["position_rmse_m"]
     assert [(entry.name, entry.standing) for entry in found] in (
-        [("1", "tie"), ("2", "tie"), ("0", "worse")],
-        [("2", "tie"), ("1", "tie"), ("0", "worse")],
+        [("1", "unresolved"), ("2", "unresolved"), ("0", "worse")],
+        [("2", "unresolved"), ("1", "unresolved"), ("0", "worse")],
     )
     values = {entry.name: entry.value for entry in found}
     assert values["1"] == pytest.approx(rms(NOISE_M), rel=1e-9)
@@ -90,7 +101,10 @@ def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_a
     assert worse.mean == pytest.approx(values["0"] - found[0].value)
     assert worse.low < rms(NOISE_M) < worse.high
     assert found[0].worse_by is None
-    assert {entry.name for entry in found if entry.standing == "tie"} == {"1", "2"}
+    assert {entry.name for entry in found if entry.standing == "unresolved"} == {
+        "1",
+        "2",
+    }
 
 
 def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
@@ -188,12 +202,12 @@ def test_each_recording_has_a_comparison_of_its_own(
     assert [one.runs for one in found] == [("0", "3"), ("1", "4")]
 
 
-def test_the_table_has_all_numbers_and_marks_best_tie_and_worse(
+def test_the_table_has_all_numbers_and_marks_best_unresolved_and_worse(
     trio: list[Run],
 ) -> None:
     table = compare(trio)["differences"]
     mine = table[table["quantity"] == "position_rmse_m"].reset_index()
-    assert mine["standing"].tolist() == ["tie", "tie", "worse"]
+    assert mine["standing"].tolist() == ["unresolved", "unresolved", "worse"]
     assert np.isnan(mine["worse_by"][0])
     assert mine["low"][2] < mine["worse_by"][2] < mine["high"][2]
     assert mine["blocks"][2] > 20

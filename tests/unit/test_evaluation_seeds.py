@@ -69,8 +69,8 @@ def test_differences_are_paired_by_seed_and_the_standing_follows_from_the_interv
     }
     found = only(rows_of(values))
     assert {entry.name: entry.standing for entry in found.entries} == {
-        "good": "tie",
-        "same": "tie",
+        "good": "unresolved",
+        "same": "unresolved",
         "worse": "worse",
     }
     last = found.entries[-1]

@@ -45,18 +45,27 @@ def metrics_of(plain: Metrics, **consistency: Consistency) -> dict[str, Metrics]
     }
 
 
+def standing_of(worse: Estimate | None) -> str:
+    if worse is None:
+        return "best"
+    if worse.is_significant:
+        return "worse"
+    return "tie" if max(abs(worse.low), abs(worse.high)) <= 1e-6 else "unresolved"
+
+
 def compared(**differences: Estimate | None) -> Comparison:
     entries = [
         Entry(
             name,
             0.4,
             worse,
-            "worse" if worse is not None and worse.is_significant else "tie",
+            standing_of(worse),
         )
         for name, worse in differences.items()
     ]
-    if sum(entry.standing == "tie" for entry in entries) == 1:
-        entries[0] = replace(entries[0], standing="best")
+    near = {entry.standing for entry in entries[1:]} - {"worse"}
+    first = "best" if not near else "unresolved" if "unresolved" in near else "tie"
+    entries[0] = replace(entries[0], standing=first)
     return Comparison(tuple(differences), 10, 10, {"position_rmse_m": tuple(entries)})
 
 

@@ -32,6 +32,15 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -
         assert axes.get_window_extent().width > 0.7 * figure.bbox.width
 
 
+def test_fonts_of_vector_files_are_truetype(
+    runs: list[EvaluatedRun], tmp_path: Path
+) -> None:
+    plot.errors(runs).savefig(tmp_path / "figure.pdf")
+    content = (tmp_path / "figure.pdf").read_bytes()
+    assert b"/Type3" not in content
+    assert b"/Subtype /TrueType" in content or b"/CIDFontType2" in content
+
+
 def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -> None:
     (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
     assert plot.arrivals(runs[0], style=tmp_path / "mine.mplstyle").axes[

@@ -76,14 +76,25 @@ def test_far_positions_warn_once(caplog):
     here = replace(HERE, latitude_deg=41.2)  # of no other test
     plane, opened_again = LocalPlane(here), LocalPlane(here)
     with caplog.at_level(logging.WARNING):
-        plane.position_m(here.latitude_deg + 0.85, here.longitude_deg)
+        for _ in range(20):
+            plane.position_m(here.latitude_deg + 0.85, here.longitude_deg)
         assert not caplog.records
-        plane.position_m(here.latitude_deg + 1.0, here.longitude_deg)
-        plane.position_m(here.latitude_deg + 1.1, here.longitude_deg)
-        opened_again.position_m(here.latitude_deg + 1.0, here.longitude_deg)
+        for _ in range(12):
+            plane.position_m(here.latitude_deg + 1.0, here.longitude_deg)
+            opened_again.position_m(here.latitude_deg + 1.0, here.longitude_deg)
     assert [record.message for record in caplog.records] == [
-        "a position is 111 km from the origin 41.2000, 2.0800: set `input.origin` within 100 km of the positions"
+        "positions are 111 km from the origin 41.2000, 2.0800: set `input.origin` within 100 km of the positions"
     ]
+
+
+def test_outlying_positions_give_no_advice_to_move_the_origin(caplog):
+    here = replace(HERE, latitude_deg=41.3)
+    plane = LocalPlane(here)
+    with caplog.at_level(logging.WARNING):
+        for k in range(1000):
+            is_outlier = k % 50 == 0
+            plane.position_m(here.latitude_deg + 3.0 * is_outlier, here.longitude_deg)
+    assert not caplog.records
 
 
 def table(folder, name="flight.csv"):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from fgtrack.evaluation.comparison import NEGLIGIBLE, Comparison, Entry
+from fgtrack.evaluation.comparison import Comparison, Entry
 from fgtrack.evaluation.diagnostics.noise import FEWEST, is_far_off
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import Metrics
@@ -70,13 +70,13 @@ def who_is_best(entries: Sequence[Entry], when: str) -> str:
     only by rounding.
     """
     best, *others = entries
-    near = [entry for entry in others if entry.standing == "tie"]
+    near = [entry for entry in others if entry.standing in ("tie", "unresolved")]
     worse = [entry for entry in others if entry.standing == "worse"]
     value = f"position RMSE {short(best.value)} m"
     names = _listed([best.name, *(one.name for one in near)])
     if not near:
         first = f"{best.name} is best {when} ({value})"
-    elif all(_is_rounding(entry, best.value) for entry in near):
+    elif all(entry.standing == "tie" for entry in near):
         first = f"{names} tie {when} ({value})"
     elif len(near) == 1:
         difference = f"{near[0].name} is worse by {_metres(near[0])}"
@@ -86,12 +86,6 @@ def who_is_best(entries: Sequence[Entry], when: str) -> str:
         first = f"The differences between {names} {when} are not resolved ({value}, {difference})"
     named = ", ".join(f"{entry.name} is {_metres(entry, ' worse')}" for entry in worse)
     return f"{first}; {named}." if named else f"{first}."
-
-
-def _is_rounding(entry: Entry, value: float) -> bool:
-    """True if the whole interval of the difference is rounding of `value`."""
-    worse = entry.worse_by or UNKNOWN
-    return max(abs(worse.low), abs(worse.high)) <= NEGLIGIBLE * value
 
 
 def _metres(entry: Entry, what: str = "") -> str:

@@ -75,12 +75,14 @@ def close_up(
     """A late detection, and its effect on the estimates of each run.
 
     The upper plots show the present position relative to the true position, for each
-    run. The direction of travel points to the right. Nearer to the centre is better.
+    run. The direction of travel points to the right. With truth, nearer to the centre
+    is better.
     The lower plots show the error of the estimates over their stamps, before the
     detection arrived (grey) and after. A narrow figure has a single plot with all
     errors.
 
-    Without truth the final estimate of the first run is the reference. `close_ups` has
+    Without truth the final estimate of the first run is the centre, and no run is
+    judged. `close_ups` has
     an entry for each run, of the same detection: `fgtrack.close_ups`. Raises
     `CallError` if their number differs, or they belong to different detections.
     """
@@ -151,7 +153,11 @@ def close_up(
         above, below = rows[:, k]
         above.set_title(f"{run.label}\n{texts[k]}", color=style.colour, loc="left")
         _draw_present(
-            above, style, ends_m[k], reach_m, "reference" if truth is None else "truth"
+            above,
+            style,
+            ends_m[k],
+            reach_m,
+            every[0].label if truth is None else "truth",
         )
         _draw_errors(
             below,
@@ -166,9 +172,12 @@ def close_up(
     rows[0, 0].set_ylabel("to the left [m]")
     rows[1, 0].set_ylabel(quantity)
     sensor = first.arrival.sensor.replace("_", " ")
-    sheet.title(
-        f"A {sensor} detection arrives {late_ms:.0f} ms late: nearer to the centre is better"
+    centre = (
+        "nearer to the centre is better"
+        if truth is not None
+        else f"without truth the centre is {every[0].label} afterwards, so no run is judged"
     )
+    sheet.title(f"A {sensor} detection arrives {late_ms:.0f} ms late: {centre}")
     if sheet.has_title:
         rule = "\n".join(
             textwrap.wrap(first.rule, int(17 * sheet.figure.get_figwidth()))

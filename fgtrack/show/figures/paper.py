@@ -40,6 +40,9 @@ _STYLE: Mapping[str, Any] = {  # Any: values of rcParams
     "text.parse_math": False,
     "agg.path.chunksize": 20_000,
     "svg.hashsalt": "fgtrack",
+    # TrueType: publishers as IEEE refuse Type 3, which is matplotlib's default.
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
 }
 #: Additional settings for a figure as narrow as a column.
 _COLUMN: Mapping[str, Any] = {

@@ -489,9 +489,11 @@ class Viewer {
   }
 
   /** Pose of the followed object at this time, in the recording of `run`. */
-  target({ recording, trackPaths }) {
+  target({ recording }) {
     const id = Number(this.follow.split(" ")[1]);
-    const path = { ego: recording.ego, object: recording.objects.get(id), track: trackPaths.get(id) };
+    // Equal numbers belong to different objects in other runs, so all panes follow the position in the first run.
+    const track = this.scene.runs[0].recording === recording ? this.scene.runs[0].trackPaths.get(id) : undefined;
+    const path = { ego: recording.ego, object: recording.objects.get(id), track };
     return path[this.follow.split(" ")[0]]?.near(this.time) ?? { x: 0, y: 0 };
   }
 
