@@ -21,17 +21,13 @@ DOCS := $(TEST) $(VENV)/.docs
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
 
-# Importing compiles the loops that numba has not stored yet; in two halves, else each worker would compile all of them.
-K := fgtrack.estimation.kernels
-S := fgtrack.estimation.smoothing
-LOOPS := $(K).kalman, $(K).replay, $(K).replay_steps, fgtrack.models.transitions, fgtrack.models.measurement_kernels, \
-    fgtrack.models.feet, fgtrack.karle2023.euler_kernels, fgtrack.karle2023.storage_kernels, \
-    fgtrack.tracking.kernels, fgtrack.tracking.facing_kernels, fgtrack.tracking.lives.counter_kernels, \
-    fgtrack.tracking.lives.existence_kernels, fgtrack.tracking.lives.visibility_kernels
-SMOOTHER_LOOPS := $(S).solution_kernels, $(S).interpolation_kernels, $(S).linearisation_kernels, \
-    $(S).relinearisation_kernels, $(S).insertion_kernels, $(S).factor_kernels
+# Importing a module compiles its loops, unless numba has stored them; in two halves, else each worker would do all of it.
+LOOPS = $(shell grep -rl -e '^@njit.' -e '^@shared.' --include='*.py' fgtrack | LC_ALL=C sort | sed 's/\.py$$//; s|/|.|g')
+SMOOTHER_LOOPS = $(filter fgtrack.estimation.smoothing.%,$(LOOPS))
+IMPORTED = $(foreach module,$(1),import $(module);)
 test: $(TEST)
-	@$(BIN)/python -c 'import $(LOOPS)' & $(BIN)/python -c 'import $(SMOOTHER_LOOPS)'; wait
+	@$(BIN)/python -c '$(call IMPORTED,$(filter-out $(SMOOTHER_LOOPS),$(LOOPS)))' & \
+	    $(BIN)/python -c '$(call IMPORTED,$(SMOOTHER_LOOPS))'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests of the core: within a minute of processor time.
