@@ -21,10 +21,15 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import StatesAt
 from fgtrack.karle2023.filter_defects import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Likely, assigned, near
+from fgtrack.tracking.association import (
+    Assignment,
+    Association,
+    AssociationProblem,
+    assigned,
+    near,
+)
 from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego.trajectory import EgoPose, EgoStd, EgoTrajectory
-from fgtrack.tracking.facing import Facings
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
 from fgtrack.tracking.lives.counters import (
     COUNTER,
@@ -34,7 +39,6 @@ from fgtrack.tracking.lives.counters import (
     Scan,
 )
 from fgtrack.tracking.lives.latency import FOREVER
-from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
 from fgtrack.tracking.tracker import MultiObjectTracker
@@ -257,7 +261,7 @@ class NeighbourhoodMerge(Merge):
 
 
 @dataclass(frozen=True)
-class UngatedEuclidean:
+class UngatedEuclidean(Association):
     """Hungarian assignment over all pairs, gated only afterwards (defect Q10).
 
     A pair beyond the gate is split. Both partners then stay unassigned, even if a good
@@ -273,18 +277,12 @@ class UngatedEuclidean:
         """See `Association`."""
         return False
 
-    def __call__(
-        self,
-        candidates: Candidates,
-        states: StatesAt,
-        apart: Apart | None = None,
-        likely: Likely | None = None,
-        facings: Facings | None = None,
-    ) -> Assignment:
-        """See `Association`; `apart` is ignored.
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """See `Association.assign`; pairs that are `apart` are not excluded.
 
         Detections of split pairs come after the detections without a partner.
         """
+        candidates, states = problem.candidates, problem.states
         pairs = near(candidates, states.means, np.inf)
         rows, columns, distances_m = (array.tolist() for array in pairs)
         cost = dict(zip(zip(rows, columns, strict=True), distances_m, strict=True))

@@ -14,7 +14,6 @@ from fgtrack.core.types import FloatArray, Message
 from fgtrack.estimation.base import (
     Measurement,
     Start,
-    StatesAt,
     TrackBank,
     UpdateResult,
 )
@@ -26,20 +25,19 @@ from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.runs import Run
 from fgtrack.tracking.association import (
     Assignment,
+    Association,
+    AssociationProblem,
     GatedEuclidean,
     GatedMahalanobis,
-    Likely,
 )
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego.trajectory import EgoPose
-from fgtrack.tracking.facing import SIGNED, Facings
+from fgtrack.tracking.facing import SIGNED
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Batch
-from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import (
     Candidate,
-    Candidates,
     Preprocessed,
     Preprocessing,
 )
@@ -124,7 +122,7 @@ class MeasurementRecorder:
 
 
 @dataclass(frozen=True)
-class _WideGate:
+class _WideGate(Association):
     """Association whose gate is widened to `stds` standard deviations of each detection.
 
     The probability of a Mahalanobis gate is raised too.
@@ -135,16 +133,12 @@ class _WideGate:
 
     @property
     def reads_yaws(self) -> bool:
+        """See `Association.reads_yaws`."""
         return self.association.reads_yaws
 
-    def __call__(
-        self,
-        candidates: Candidates,
-        states: StatesAt,
-        apart: Apart | None = None,
-        likely: Likely | None = None,
-        facings: Facings | None = None,
-    ) -> Assignment:
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """See `Association.assign`."""
+        candidates, states, apart, _, facings = problem
         stds_m = np.array(
             [self._stds_m(candidate, states.means) for candidate in candidates]
         )
@@ -157,7 +151,7 @@ class _WideGate:
         opened = replace(
             self.association, max_distance_m=limit_m, gate_probability=probability
         )
-        return opened(candidates, states, apart, likely, facings)
+        return opened.assign(problem)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Return the largest position standard deviation for each track position in `means`.

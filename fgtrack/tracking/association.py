@@ -1,8 +1,9 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
@@ -55,10 +56,24 @@ class Assignment(NamedTuple):
     """Readings of the pairs that were compared, where a detection may be read in several ways."""
 
 
-class Association(Protocol):
-    """Assigns candidates to tracks at least cost."""
+class AssociationProblem(NamedTuple):
+    """Candidates of one stamp and the tracks that they may belong to, with the states of the tracks at this stamp."""
+
+    candidates: Candidates
+    states: StatesAt
+    apart: Apart | None = None
+    """Excludes pairs that cannot be the same object."""
+    likely: Likely | None = None
+    """Selects pairs by their costs NIS + log det S; an association by distance ignores it."""
+    facings: Facings | None = None
+    """Readings of yaws that may be half a turn off; None if every yaw is taken as measured."""
+
+
+class Association(ABC):
+    """Base of the associations, which assign candidates to tracks at least cost."""
 
     @property
+    @abstractmethod
     def reads_yaws(self) -> bool:
         """True if the gate is a likelihood; only such a gate can read a yaw that is half a turn off."""
 
@@ -70,15 +85,18 @@ class Association(Protocol):
         likely: Likely | None = None,
         facings: Facings | None = None,
     ) -> Assignment:
-        """Assign candidates to tracks, whose states are at the candidates' stamp.
+        """Assign candidates to tracks. The arguments are the fields of `AssociationProblem`."""
+        return self.assign(
+            AssociationProblem(candidates, states, apart, likely, facings)
+        )
 
-        Pairs that are `apart` are excluded. `likely` selects pairs by their costs NIS + log det S; an association by
-        distance ignores it. Without `facings` every yaw is taken as measured.
-        """
+    @abstractmethod
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """Assign the candidates of a problem to its tracks."""
 
 
 @settings
-class GatedEuclidean:
+class GatedEuclidean(Association):
     """Hungarian assignment on distances; the gate excludes pairs before the assignment.
 
     `max_nis` excludes pairs by their innovation as well, for instance a ghost that crosses a track at another speed. An
@@ -97,15 +115,9 @@ class GatedEuclidean:
         """See `Association`; without `max_nis` every pair inside the gate is fused as it is."""
         return self.max_nis is not None
 
-    def __call__(
-        self,
-        candidates: Candidates,
-        states: StatesAt,
-        apart: Apart | None = None,
-        likely: Likely | None = None,
-        facings: Facings | None = None,
-    ) -> Assignment:
-        """See `Association`."""
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """See `Association.assign`."""
+        candidates, states, apart, _, facings = problem
         return self.within(self.gate_m, candidates, states, apart, facings)
 
     def within(
@@ -145,7 +157,7 @@ class GatedEuclidean:
 
 
 @settings
-class GatedMahalanobis:
+class GatedMahalanobis(Association):
     """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
 
     The gate grows with the predicted covariance, so it serves sensors of any rate. The cost contains the
@@ -170,15 +182,9 @@ class GatedMahalanobis:
         """See `Association`."""
         return True
 
-    def __call__(
-        self,
-        candidates: Candidates,
-        states: StatesAt,
-        apart: Apart | None = None,
-        likely: Likely | None = None,
-        facings: Facings | None = None,
-    ) -> Assignment:
-        """See `Association`; claims are the tracker's."""
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """See `Association.assign`. The tracker itself applies `claim_m`."""
+        candidates, states, apart, likely, facings = problem
         pairs, readings = self._gated(candidates, states, apart, facings)
         if likely is not None and len(pairs.rows):
             pairs = pairs.at(likely(pairs))
