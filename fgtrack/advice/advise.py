@@ -34,13 +34,13 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.meaning.assumed import source_of
 from fgtrack.meaning.assumption import Assumed
+from fgtrack.meaning.corrected import corrected
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.draft import drafted
 from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
 from fgtrack.meaning.times import clock_constant
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
-from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.tracking.ego.trajectory import MAX_EXTRAPOLATION_S
 

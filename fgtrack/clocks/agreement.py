@@ -25,7 +25,7 @@ from fgtrack.core.types import (
     IntArray,
     Message,
 )
-from fgtrack.pipeline.clock import corrected
+from fgtrack.meaning.corrected import corrected
 from fgtrack.runs import COLUMNS, Run
 
 __all__ = ["Agreement", "agreement_findings", "agreements"]

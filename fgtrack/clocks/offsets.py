@@ -44,7 +44,7 @@ from fgtrack.core.geometry import rotations
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
-from fgtrack.pipeline.clock import corrected
+from fgtrack.meaning.corrected import corrected
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.runs import COLUMNS, Run
 

@@ -93,6 +93,8 @@ class EgoConfig:
     """
     detection_origin_y_m: float = 0.0
     """Origin of the ego frame of detections, to the left of the ego reference point."""
+    clock_offset_s: Annotated[float, Field(ge=-86_400.0, le=86_400.0)] = 0.0
+    """Stamp of the ego's states minus time of measurement; it is subtracted from each stamp before any other use."""
     uncertainty: Literal["none", "independent"] = "independent"
     """Use of the ego's covariance: `none` ignores it, as in the paper.
 

@@ -16,6 +16,7 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.inputs.source import InputSource
 from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
 from fgtrack.meaning.components import uninformative
+from fgtrack.meaning.corrected import corrected_message
 from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
@@ -174,9 +175,10 @@ def _covered(
                     isinstance(message, DetectionList)
                     and message.sensor in config.ignore_sensors
                 ):
+                    read = corrected_message(message, config)
                     if len(first) < _FIRST_MESSAGES:
-                        first.append(message)
-                    yield message
+                        first.append(read)
+                    yield read
 
     named = set(config.input.detections) | set(config.input.csv.detections)
     result = {name: Coverage() for name in named.difference(config.ignore_sensors)}

@@ -7,6 +7,7 @@ from pathlib import Path
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.types import Message
+from fgtrack.meaning.clocks import clock_decisions
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.placement import frame_decisions, mount_decisions
 from fgtrack.meaning.sample import Sample, Test, first_messages
@@ -14,8 +15,14 @@ from fgtrack.meaning.velocity_test import velocity_decisions
 
 __all__ = ["TESTS", "decided"]
 
-#: Tests in their order: frames, mounts, velocities, times, orientations.
-TESTS: tuple[Test, ...] = (frame_decisions, mount_decisions, velocity_decisions)
+_NO_SENSORS = frozenset(("ego", "truth", "the recording"))
+#: Tests in their order: clocks, frames, mounts, velocities.
+TESTS: tuple[Test, ...] = (
+    clock_decisions,
+    frame_decisions,
+    mount_decisions,
+    velocity_decisions,
+)
 
 
 def decided(
@@ -40,8 +47,11 @@ def decided(
         new = [each for each in test(sample) if each.about not in settled]
         before = config.input
         config = _with(config, new, sample)
-        asked = {each.about for each in new if each.certainty == "open"}
-        if asked or config.input != before:
+        asked = {each.about for each in new if each.certainty == "open"} - _NO_SENSORS
+        changes_times = any(
+            path[-1] == "clock_offset_s" for each in new for path in each.settings
+        )
+        if asked or changes_times or config.input != before:
             ignored = tuple(dict.fromkeys([*config.ignore_sensors, *sorted(asked)]))
             config = replace(config, ignore_sensors=ignored)
             messages = None

@@ -11,6 +11,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.inputs.source import open_input
 from fgtrack.meaning.assumption import departures, is_given
+from fgtrack.meaning.corrected import corrected_message
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.input_checks import messages_within
 
@@ -67,5 +68,5 @@ def first_messages(path: Path, config: Config) -> list[Message]:
                 and message.sensor in config.ignore_sensors
             )
             if not ignored:
-                result.append(message)
+                result.append(corrected_message(message, config))
     return result

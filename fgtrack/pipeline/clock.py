@@ -1,13 +1,11 @@
-"""Time in a replay: corrected stamps of sensors, and ticks of the node."""
+"""Time in a replay: ticks of the node, and the messages of each."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from typing import NamedTuple
 
-from fgtrack.core.time import nanoseconds, period_ns
+from fgtrack.core.time import period_ns
 from fgtrack.core.types import DetectionList, EgoState
-from fgtrack.models.sensors import SensorModel
 
 Delivered = EgoState | DetectionList
 
@@ -46,29 +44,3 @@ def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
         before = tick
     if before is not None:
         yield before, True
-
-
-def corrected(
-    message: DetectionList, sensors: Mapping[str, SensorModel]
-) -> DetectionList:
-    """Return `message` with the stamp that `sensors` specifies: its receipt, or its stamp minus the clock offset.
-
-    A clock offset is also subtracted from the receipt.
-    """
-    sensor = sensors.get(message.sensor)
-    if sensor is None or (
-        sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0
-    ):
-        return message
-    from fgtrack.sim.new_delays import restamped
-
-    offset_ns = nanoseconds(sensor.clock_offset_s)
-    if sensor.stamp_from == "receipt":
-        objects = tuple(
-            item if item.stamp_ns is None else replace(item, stamp_ns=None)
-            for item in message.objects
-        )
-        return replace(
-            message, stamp_ns=message.receipt_ns - offset_ns, objects=objects
-        )
-    return restamped(message, message.stamp_ns - offset_ns)

@@ -40,8 +40,8 @@ from fgtrack.inputs.validation import (
     validated_detection,
     validated_head,
 )
+from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import corrected
 from fgtrack.runs import Node
 from fgtrack.tracking.lives.latency import NEWEST
 from fgtrack.tracking.tracker_state import TrackerState
@@ -417,7 +417,7 @@ class Tracker:
             message, receipt_ns=now_ns if is_ahead else message.receipt_ns
         )
         if isinstance(message, EgoState):
-            return message
+            return corrected_ego(message, self.config.ego.clock_offset_s)
         message = corrected(message, self.config.sensors)
         if message.frame != "map":
             self._need_ego[message.sensor] = None

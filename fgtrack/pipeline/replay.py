@@ -16,8 +16,9 @@ from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TickReport, TruthState
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.meaning.assumed import assumed, is_open, source_of
+from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with_last
+from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, with_last
 from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run
 from fgtrack.tracking.parts import TrackerParts, check_sensor
 from fgtrack.tracking.tracker import MultiObjectTracker
@@ -55,6 +56,8 @@ class Feed:
                         continue
                     check_sensor(message.sensor, sensors)
                     message = corrected(message, sensors)
+                elif isinstance(message, EgoState):
+                    message = corrected_ego(message, self._config.ego.clock_offset_s)
                 if not isinstance(message, TruthState):
                     self._check_receipt(message.receipt_ns)
                 yield message

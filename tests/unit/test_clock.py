@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.core.types import Detection, DetectionList, EgoState
+from fgtrack.meaning.corrected import corrected
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.clock import Delivered, clock_ticks, corrected
+from fgtrack.pipeline.clock import Delivered, clock_ticks
 
 MS = 1_000_000
 receipts = st.lists(st.integers(0, 300 * MS), max_size=20).map(sorted)
