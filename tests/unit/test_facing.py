@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from support.tracking import START_NS
 
 from fgtrack.core.linalg import kernels
+from fgtrack.core.state import to_bytes
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt
 from fgtrack.models.correlated_errors import ColouredNoiseMeasurement
@@ -643,3 +644,11 @@ def test_the_heading_of_the_map_is_turned_for_a_track_known_by_its_rear_and_teac
     assert (after.log_odds == before.log_odds).all()
     assert (after.shares == before.shares).all()
     assert tracks.facing.counts == {}
+
+
+def test_a_track_whose_start_was_interrupted_has_no_front_to_forget() -> None:
+    tracks = Tracks()
+    before = to_bytes(tracks.facing.checkpoint())
+    tracks.facing.forget(7)
+    assert to_bytes(tracks.facing.checkpoint()) == before
+    assert tracks.see(0.3) == [None]

@@ -256,3 +256,35 @@ def test_bad_data_propagates_and_leaves_no_track_in_an_unknown_state() -> None:
     with pytest.raises(DataError, match="not this one"):
         step(bank, 600 * MS, [6.0, 3000.0])
     assert bank.track_ids == ()
+
+
+class FailsOnce(ObjectBank):
+    """A bank that raises at the first `left` questions for its states."""
+
+    def __init__(self, left: list[int]) -> None:
+        super().__init__(MOTION, Moody, 1.0)
+        self.left = left
+
+    def present(self) -> list[TrackState]:
+        if self.left[0]:
+            self.left[0] -= 1
+            raise RuntimeError("not now")
+        return super().present()
+
+
+def test_a_bank_that_raises_once_without_tracks_is_made_again() -> None:
+    left = [1]
+    bank = GuardedBank(lambda: FailsOnce(left))
+    bank.advance(100 * MS)
+    assert list(bank.present()) == []
+    assert counted(bank) == {"estimator raised": 1}
+    bank.birth(3, Start(stamp_ns=100 * MS, yaw_rad=0.0, speed_std_mps=1.0))
+    assert step(bank, 200 * MS, [1.0])[0][0].status is UpdateStatus.IN_SEQUENCE
+
+
+def test_a_bank_that_raises_twice_without_tracks_cannot_go_on() -> None:
+    left = [2]
+    bank = GuardedBank(lambda: FailsOnce(left))
+    bank.advance(100 * MS)
+    with pytest.raises(DataError, match=r"even without tracks .* not now"):
+        bank.present()
