@@ -205,6 +205,8 @@ class Fault:
         set_(self.point.owner, self.point.name, value)
 
 
+#: Covariance intersection may give a late measurement the weight 0.
+WEIGHING = ("ci",)
 Key = tuple[str, int, int]
 States = dict[int, tuple[FloatArray, FloatArray]]
 """State and covariance of each object that has a track."""
@@ -285,8 +287,9 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
                 for each in (track_id, -1 - track_id)
                 for a, b in zip(before.get(each, ()), after.get(each, ()), strict=False)
             )
+            may_stay = claims.held_s or tracker.config.estimator in WEIGHING
             if result.status in FUSED and (
-                track_id not in after or (same and not claims.held_s)
+                track_id not in after or (same and not may_stay)
             ):
                 outcome.lies.append(
                     f"track {track_id} is {result.status}, but its state is as before, or gone"
