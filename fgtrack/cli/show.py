@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import count
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +17,8 @@ from fgtrack.evaluation.tables import Table, Tables, bulleted
 _WIDTH_WITHOUT_TERMINAL = 120
 #: Period from which the remaining time is estimated; it is long, because the jobs of a sweep differ.
 _SPEED_PERIOD_S = 600.0
+# Number of lines of progress in a log.
+_LOG_LINES = 10
 
 
 class _Output(Console):
@@ -75,16 +78,33 @@ def show(
         say(text.removesuffix("\n"))
 
 
+def _logged(what: str, total: int | None) -> Callable[..., None]:
+    """Return a function that counts steps and prints a line at each tenth of `total` to stderr."""
+    done = count(1)
+
+    def moved(text: str = "", share: float | None = None) -> None:
+        if total is None or share is not None:
+            return
+        number = next(done)
+        if number * _LOG_LINES // total > (number - 1) * _LOG_LINES // total:
+            line = f"fgtrack: {what}: {number} of {total}"
+            print(one_line(line), file=sys.stderr, flush=True)
+
+    return moved
+
+
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Show a progress bar during the block, if stderr is a terminal.
+
+    Without a terminal, a line is printed at each tenth of `total` steps, for a log.
 
     Yields a function that advances the bar: `moved(text)` by one step, `moved(text,
     share)` to a share from 0 to 1.
     """
     stderr = Console(stderr=True)
     if not stderr.is_terminal:
-        yield lambda *_, **__: None
+        yield _logged(what, total)
         return
     from rich.progress import Progress
 

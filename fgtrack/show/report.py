@@ -118,6 +118,8 @@ def _page(
     ]
     sections += [_folded(name, content) for name, content in folded_parts.items()]
     labels = ", ".join(one.label for one in runs)
+    paths = [(one.run.meta.get("input") or {}).get("path") for one in runs]
+    recordings = ", ".join(dict.fromkeys(Path(path).name for path in paths if path))
     contents = {
         "version": escape(fgtrack.__version__),
         "title": escape(
@@ -125,7 +127,9 @@ def _page(
             if len(runs) == 1
             else f"fgtrack report of {len(runs)} runs"
         ),
-        "subtitle": escape(labels),
+        "subtitle": escape(
+            printable(f"{recordings}: {labels}" if recordings else labels)
+        ),
         "style": _template("page.css"),
         "parts": "".join(sections),
         "scene": json.dumps(scene, allow_nan=False, separators=(",", ":")).replace(

@@ -127,6 +127,12 @@ def test_it_has_every_part_and_every_run(page: str, folder: Path) -> None:
     )
 
 
+def test_it_names_the_recording_and_its_figures_fit_a_dark_page(page: str) -> None:
+    (subtitle,) = re.findall('<p class="soft">([^<]*)</p>\n</header>', page)
+    assert re.match(r"\S+\.jsonl: ", subtitle)
+    assert "prefers-color-scheme: dark) { .figure img { filter: invert" in page
+
+
 def test_it_loads_nothing_and_is_small(page: str) -> None:
     for tag, attributes in elements(page):
         for name in ("src", "href", "action", "poster", "data", "srcset"):

@@ -91,6 +91,36 @@ def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
     assert str(again).startswith("lidar: 3 of 3")
 
 
+@pytest.mark.parametrize("late", [20, 60])
+def test_late_detections_that_an_estimator_drops_by_design_are_no_warning(
+    late: int, tmp_path: Path
+) -> None:
+    def told(estimator: str) -> list[str]:
+        run = write_run(
+            tmp_path / estimator,
+            [[]] * 80,
+            updates={
+                0: [
+                    *(
+                        update(
+                            tick=k,
+                            disposition=Disposition.TOO_OLD,
+                            delay_ns=3_500_000_000,
+                        )
+                        for k in range(late)
+                    ),
+                    *lists(Disposition.IN_SEQUENCE, 80 - late),
+                ]
+            },
+            meta={"effective": SMOOTHER, "estimator": estimator},
+            config_text=CONFIG,
+        )
+        return list(map(str, diagnostics(run)))
+
+    assert told("drop") == []
+    assert told("ekf-replay")
+
+
 @pytest.mark.parametrize(("failed", "is_told"), [(6, True), (4, False)])
 def test_failed_detections_above_5_percent_name_the_first_failure(
     failed: int, is_told: bool, tmp_path: Path

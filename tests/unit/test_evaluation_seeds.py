@@ -188,7 +188,10 @@ def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> 
         [4, 4, 1],
     )
     text = str(shown)
-    assert "0.500 ± 0.041" in text
-    assert "false_tracks" not in text
-    assert "false_tracks" in str(shown.in_full())
+    assert "0.500 ± 0.130" in text, (
+        "3.18 standard errors of 0.041, by Student's t of 3 degrees of freedom"
+    )
+    assert "0.500 ± 0.130" in shown.to_latex().replace("$\\pm$", "±")
+    assert "false tracks" not in text
+    assert "false tracks" in str(shown.in_full())
     assert next(csv.DictReader(io.StringIO(shown.to_csv())))["delay"] == cells["delay"]

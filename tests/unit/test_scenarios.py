@@ -1,11 +1,17 @@
 """The committed scenarios and the built-in one, which is a picture of the data of Karle et al. 2023, section III-H."""
 
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
+from fgtrack.sim.scenario import EgoMessages, Scenario
+from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.simulate import simulate
+from fgtrack.sim.vehicles import TrackVehicle
 
 EGO_ID = -1
 
@@ -71,3 +77,11 @@ def test_cars_of_the_default_follow_each_other_and_overtake_at_the_speeds_of_the
     assert edges[counts.argmax()] == -0.5  # the peak of the distribution is at 0
     assert relative.min() < -5.0
     assert relative.max() > 5.0
+
+
+def test_the_page_on_scenarios_names_every_key() -> None:
+    page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
+    kinds = (Scenario, SimulatedSensor, EgoMessages, TrackVehicle)
+    names = [item.name for kind in kinds for item in fields(kind)]
+    missing = [name for name in names if f"`{name}`" not in page and name != "kind"]
+    assert not missing

@@ -74,6 +74,20 @@ def test_means_and_standard_errors_are_those_of_the_seeds(tmp_path: Path) -> Non
     assert means["seeds"].tolist()[-1] == 2  # the empty cell is left out
 
 
+def test_a_sweep_over_delays_has_a_figure_of_error_against_delay(
+    tmp_path: Path,
+) -> None:
+    table = read_sweep(a_sweep(tmp_path / "one"))
+    plans = plot.planned_sweep(table)
+    assert plans[0].name == "error_against_delay"
+    axes = plans[0].draw().axes[0]
+    lines = {line.get_label(): line.get_xdata().tolist() for line in axes.lines}
+    assert lines == {f"estimator-{k}": [50.0, 100.0, 200.0] for k in range(2)}
+    gates = read_sweep(a_sweep(tmp_path / "two", gates=("5.0", "9.0")))
+    names = [plan.name for plan in plot.planned_sweep(gates)]
+    assert "error_against_delay" not in names, "two axes"
+
+
 def test_the_figure_has_a_line_with_bars_for_each_estimator(tmp_path: Path) -> None:
     figure = plot.sweep(a_sweep(tmp_path / "sweep"))
     (axes,) = figure.axes

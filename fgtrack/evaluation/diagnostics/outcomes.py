@@ -18,6 +18,8 @@ USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
 """Dispositions of detections that were used."""
 FAILED_SHARE = 0.05
 """Share of failed detections of a sensor above which the failures are reported."""
+# Estimator that leaves out late measurements by design.
+_DROPS = "drop"
 # A stamp further after its receipt is invalid (`tracking.inbox`).
 _AHEAD_S = 1.0
 # Fewer failed detections may be the border of a recording.
@@ -139,7 +141,8 @@ def unused_diagnostics(run: Run) -> Iterator[Diagnostic]:
             )
             yield Diagnostic(sensor, text)
             continue
-        if name == "failed" or (name == "too_old" and sensor in unset):
+        is_design = name == "too_old" and run.meta.get("estimator") == _DROPS
+        if name == "failed" or is_design or (name == "too_old" and sensor in unset):
             continue  # `failed_diagnostics` reports failed detections
         if name == "duplicate" and (section(run, "sensors").get(sensor) or {}).get(
             "copies_s"
@@ -156,6 +159,8 @@ def unused_diagnostics(run: Run) -> Iterator[Diagnostic]:
 
 def late_diagnostics(run: Run) -> Iterator[Diagnostic]:
     """Yield delays beyond the limits of the estimator or the inbox, unless most detections already have a reason."""
+    if run.meta.get("estimator") == _DROPS:
+        return
     explained = {sensor for sensor, _, _, _ in _mostly_unused(run)}
     for sensor, mine in by_sensor(run.tables["updates"]):
         if sensor not in explained and mine["stamp_ns"].any():

@@ -222,7 +222,8 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     ]
     notes = [
         "GOSPA: root mean square over ticks; its square is the sum of the squares of its parts; scores: 100 is perfect",
-        "unseen: missed objects that no sensor could detect; the scores in % count them too",
+        "unseen: missed objects that no sensor could detect; the scores in % count them too, so MOTA may be far below "
+        "the tracked share of the time in view",
         "confirm: from an object's first detection to its first confirmed track",
     ]
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)

@@ -1,14 +1,15 @@
 """Tables of a sweep over its seeds: means at every grid point, and paired differences of the estimators."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from textwrap import wrap
 from typing import Literal
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.files import open_text
@@ -22,8 +23,12 @@ from fgtrack.evaluation.comparison import (
 )
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
+from fgtrack.evaluation.tables.metric_names import metric_words
 
 SWEEP_FILE = "sweep.csv"
+# Width of a heading, and quantile of a two-sided 95 % interval.
+_HEADING = 14
+_UPPER = 0.975
 #: Better direction of each metric, in order of preference; tables show the first metric.
 _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "truth.overall.errors.*.rmse": "less",
@@ -228,7 +233,10 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
 
 
 def summary_table(sweep: SweepTable) -> Table:
-    """Return mean and standard error over the seeds of every metric, a row for each point and estimator."""
+    """Return the mean over the seeds of every metric, and half of its 95 % interval, for each point and estimator.
+
+    The records contain the standard error, too.
+    """
     metrics = [name for name in sweep.metrics if sweep.rows[name].notna().any()]
     main = [name for name in _MAIN if name in metrics] or metrics[: len(_MAIN)]
     metrics = list(dict.fromkeys((*main, *metrics)))
@@ -236,10 +244,14 @@ def summary_table(sweep: SweepTable) -> Table:
     errors = groups.sem().add_suffix(".standard_error")
     seeds = groups.count().max(axis=1).rename("seeds")
     names = [
-        name for metric in metrics for name in (metric, f"{metric}.standard_error")
+        name
+        for metric in metrics
+        for name in (metric, f"{metric}.standard_error", f"{metric}.half")
     ]
+    t = stdtrit(np.maximum(groups.count() - 1, 1), _UPPER)
+    halves = (groups.sem() * t).add_suffix(".half")
     records = (
-        pd.concat([groups.mean(), errors], axis=1)[names]
+        pd.concat([groups.mean(), errors, halves], axis=1)[names]
         .join(seeds)
         .reset_index()
         .to_dict("records")
@@ -249,13 +261,13 @@ def summary_table(sweep: SweepTable) -> Table:
         Column("estimator", left=True),
     ]
     for name in metrics:
-        heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
-        both = (name, f"{name}.standard_error")
+        heading = _MAIN.get(name) or "\n".join(wrap(metric_words(name), _HEADING))
+        both = (name, f"{name}.half")
         scale = PERCENT if name.endswith("share_in_view") else 1.0
         columns.append(
             Column(heading, both, "{} ± {}", scale, is_extra=name not in main)
         )
-    notes = ["± standard error of the mean over the seeds"]
+    notes = ["±: half of the 95 % interval of the mean (t) over the seeds"]
     return Table(
         "Summary",
         records,

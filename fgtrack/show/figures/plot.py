@@ -23,7 +23,12 @@ from fgtrack.show.figures.map import tracks_on_map as map  # noqa: A004  # the p
 from fgtrack.show.figures.paper import Paper
 from fgtrack.show.figures.residuals import residuals
 from fgtrack.show.figures.style import save
-from fgtrack.show.figures.sweep import error_against_delay, sweep, sweep_metrics
+from fgtrack.show.figures.sweep import (
+    error_against_delay,
+    has_delays,
+    sweep,
+    sweep_metrics,
+)
 from fgtrack.show.figures.window import window
 
 __all__ = [
@@ -126,12 +131,17 @@ def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
 
 
 def planned_sweep(table: SweepTable) -> list[Planned]:
-    """Return the figures of a sweep, one for each metric; most are extras."""
+    """Return the figures of a sweep: one for each metric, most of them extras, and the error against delay."""
     first, rest = sweep_metrics(table)
-    return [
+    plans = [
         Planned(f"sweep_{metric}", partial(sweep, table, metric), metric in rest)
         for metric in (*first, *rest)
     ]
+    if has_delays(table):
+        plans.insert(
+            0, Planned("error_against_delay", partial(error_against_delay, table))
+        )
+    return plans
 
 
 def drawn(

@@ -14,38 +14,20 @@ from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
+from fgtrack.evaluation.tables.metric_names import METRIC_NAMES, metric_words, words
 from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import legend_above, log_axis
 from fgtrack.show.palette import style_of, styles
 
-#: Names of metrics; other metrics are named by their column.
-_NAMES: Mapping[str, str] = {
-    "truth.overall.errors.position_m.rmse": "position RMSE [m]",
-    "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
-    "truth.overall.errors.yaw_rad.rmse": "yaw RMSE [rad]",
-    "consistency.position_nees.mean": "mean NEES of the position",
-    "multi_object.gospa.in_view_rms_m": "GOSPA of objects in view [m]",
-    "multi_object.gospa.rms_m": "GOSPA [m]",
-    "truth.overall.tracked_share_in_view": "share of the time in view that is tracked",
-    "truth.overall.tracked_share": "share of the time that is tracked",
-    "truth.false_tracks": "false tracks",
-    "truth.overall.id_switches": "identity switches",
-    "multi_object.clear.mota": "MOTA",
-    "multi_object.identity.idf1": "IDF1",
-    "multi_object.hota.hota": "HOTA",
-}
 _POSITION = "truth.overall.errors.position_m.rmse"
 _LAGGED = "lagged.*.errors.position_m.rmse"
-_UNITS = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "mps2": "m/s²"} | {
-    name: name for name in ("s", "ms", "ns", "m", "rad")
-}
 _EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
 #: Metrics that are drawn by default.
-_FIRST = (*tuple(_NAMES)[:2], "consistency.position_nees.mean")
+_FIRST = (*tuple(METRIC_NAMES)[:2], "consistency.position_nees.mean")
 #: Patterns of all metrics that can be drawn: for each it is clear which values are better.
 _REST = (
-    *_NAMES,
+    *METRIC_NAMES,
     "truth.overall.errors.*.rmse",
     "consistency.nis.*.mean",
     "lagged.*.errors.position_m.rmse",
@@ -230,6 +212,16 @@ def error_against_delay(
     return sheet.figure
 
 
+def has_delays(table: SweepTable) -> bool:
+    """True if the sweep has a single axis of delays in seconds, and position errors, for `error_against_delay`."""
+    if len(table.shown_axes) != 1 or _POSITION not in table.metrics:
+        return False
+    (axis,) = table.shown_axes
+    name = axis.lower()
+    is_delay = "delay" in name and name.endswith("_s")
+    return is_delay and _are_numbers(table.rows[axis])
+
+
 def _means(
     table: SweepTable, metric: str
 ) -> Any:  # Any: a DataFrame, whose columns have no types
@@ -243,29 +235,3 @@ def _means(
 
 def _are_numbers(cells: Any) -> bool:
     return bool(np.isfinite(pd.to_numeric(cells, errors="coerce")).all())
-
-
-def metric_words(metric: str) -> str:
-    """Return the display name of a metric, with its unit."""
-    if metric in _NAMES:
-        return _NAMES[metric]
-    parts = metric.split(".")
-    if parts[0] == "lagged" and parts[-1] == "rmse":
-        return f"{words(parts[-2]).replace(' [', ' RMSE [')}, output {'.'.join(parts[1:-3])} s later"
-    if metric.endswith(".rmse"):
-        return words(parts[-2]).replace(" [", " RMSE [")
-    if parts[:2] == ["consistency", "nis"]:
-        return f"mean NIS of {parts[2].replace('_', ' ')}"
-    return words(metric)
-
-
-def words(name: str) -> str:
-    """Return the display name of a configuration key or column, with its unit: "delay [s]" for "sensors.x.delay_s"."""
-    plain = ".".join(name.split(".")[-2:]).replace(".", " ")
-    stem, _, unit = plain.rpartition("_")
-    text, end = (stem, f" [{_UNITS[unit]}]") if stem and unit in _UNITS else (plain, "")
-    proper = {each.lower(): each for each in ("LiDAR", "RADAR", "NEES", "NIS")}
-    return (
-        " ".join(proper.get(word, word) for word in text.replace("_", " ").split(" "))
-        + end
-    )
