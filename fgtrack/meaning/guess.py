@@ -13,7 +13,14 @@ from fgtrack.core.types import FloatArray
 from fgtrack.inputs.settings import Field, FieldPath
 from fgtrack.models.measurement import ANGULAR
 
-__all__ = ["Guess", "agreeing_with_motion", "guesses", "time_unit", "words_of"]
+__all__ = [
+    "Guess",
+    "agreeing_with_motion",
+    "guesses",
+    "is_time",
+    "time_unit",
+    "words_of",
+]
 
 #: Factor to SI by unit, for the units of lengths and speeds at the end of a name.
 _SCALES = {
@@ -238,6 +245,11 @@ def _quaternion(values: Mapping[str, Sequence[float]]) -> Guess | None:
         if len(found) == 4:
             return Guess([found[axis] for axis in "xyzw"], "yaw of the quaternion")
     return None
+
+
+def is_time(name: str) -> bool:
+    """True if the name of a field is that of a stamp or a receipt."""
+    return _component(name)[0] in ("stamp", "receipt")
 
 
 def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:

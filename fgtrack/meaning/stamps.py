@@ -4,17 +4,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from fgtrack.core.time import NS_PER_S
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S, NS_PER_UNIT
+from fgtrack.core.types import FloatArray
 from fgtrack.inputs.formats.fields import paths_of
 from fgtrack.inputs.formats.table_times import Cells
 from fgtrack.inputs.formats.time_texts import TimeForm, form_of
 from fgtrack.inputs.settings import FieldPath
-from fgtrack.meaning.guess import Guess, time_unit, words_of
+from fgtrack.meaning.guess import Guess, is_time, time_unit, words_of
+from fgtrack.meaning.times import time_columns
 
-__all__ = ["stamps", "with_stamp"]
+__all__ = ["stamps", "with_receipt", "with_stamp"]
 
 #: Number of rows from which the form of dates is inferred.
 _ROWS = 1000
+_NANOS = tuple(
+    [word]
+    for word in ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds")
+)
 _DATE_WORDS = frozenset(("date", "day", "datum"))
 
 
@@ -53,6 +61,45 @@ def _with_date(guess: Guess, cells: Sequence[Cells]) -> Guess:
     return guess
 
 
+def with_receipt(
+    own: Mapping[str, Guess], values: Mapping[str, Sequence[float]]
+) -> dict[str, Guess]:
+    """Return the guesses `own` of a table with the columns of stamp and receipt that its times show.
+
+    `values` contains the numbers in the rows by column. Stamps that are dates stay as they
+    are, and so does a receipt in another unit.
+    """
+    result = dict(own)
+    names = [name for name in values if is_time(name) or words_of(name)[-1:] in _NANOS]
+    columns: dict[str, FloatArray] = {}
+    units: dict[str, str] = {}
+    for name in names:
+        numbers = np.asarray(values[name], dtype=np.float64)
+        finite = numbers[np.isfinite(numbers)]
+        if len(finite) < len(numbers) or not len(finite):
+            continue
+        is_fraction = words_of(name)[-1:] in _NANOS
+        units[name] = "ns" if is_fraction else time_unit(name, finite.tolist())[0]
+        scale = 1.0 if is_fraction else NS_PER_UNIT[units[name]] / NS_PER_S
+        columns[name] = scale * numbers
+    stamp = paths_of(result["stamp"].path)[0] if "stamp" in result else ""
+    if stamp not in columns:
+        return result
+    found = time_columns(columns, {name: words_of(name) for name in columns})
+    if found is None:
+        return result
+    result["stamp"] = Guess(_path(found.stamp), found.reason)
+    result.pop("receipt", None)
+    unit = "s" if len(found.stamp) == 2 else units[found.stamp[0]]
+    if len(found.receipt) == 2 or (found.receipt and units[found.receipt[0]] == unit):
+        result["receipt"] = Guess(_path(found.receipt), found.reason)
+    return result
+
+
+def _path(names: Sequence[str]) -> str | list[str]:
+    return names[0] if len(names) == 1 else list(names)
+
+
 def stamps(guess: Guess, cells: Sequence[Cells]) -> tuple[list[float], str, str]:
     """Return the times in the rows, NaN for others, their unit, and the reason for the unit."""
     texts = [_joined(row, guess.path) for row in cells]
@@ -61,6 +108,12 @@ def stamps(guess: Guess, cells: Sequence[Cells]) -> tuple[list[float], str, str]
         reason = "times of day" if form.is_of_day else "dates and times"
         return [_seconds(form, text) for text in texts], "s", reason
     numbers = [_number(text.split(" ")[0]) for text in texts]
+    if len(paths_of(guess.path)) == 2:
+        numbers = [
+            whole_s + _number(text.split(" ")[1]) / NS_PER_S
+            for whole_s, text in zip(numbers, texts, strict=True)
+        ]
+        return numbers, "s", "whole seconds and nanoseconds"
     finite = [value for value in numbers if math.isfinite(value)]
     unit, reason = time_unit(paths_of(guess.path)[0], finite)
     return numbers, unit, reason

@@ -25,7 +25,7 @@ from fgtrack.meaning.parts import (
     spreads,
     unused,
 )
-from fgtrack.meaning.stamps import stamps, with_stamp
+from fgtrack.meaning.stamps import stamps, with_receipt, with_stamp
 
 __all__ = ["table_part"]
 
@@ -73,7 +73,7 @@ def table_part(
         is_named = bool(words & _EGO_TABLES) and NEEDED["ego"] <= own.keys()
         is_ego |= is_named or own.keys() >= FULL_EGO
     role = "ego" if is_ego else "truth" if is_truth else sensor_name(file.stem, parts)
-    own = with_stamp(own, cells)
+    own = with_receipt(with_stamp(own, cells), values)
     if "stamp" not in own:
         raise DataError(f"no column of times among {spreads(values)}")
     times, unit, why = stamps(own["stamp"], cells)
