@@ -41,6 +41,8 @@ _HOMES = {
     "MeasurementModel": "fgtrack.models.measurement",
     "Message": "fgtrack.core.types",
     "MotionModel": "fgtrack.models.motion",
+    "MountEstimate": "fgtrack.meaning.mounts",
+    "Mounts": "fgtrack.meaning.mounts",
     "NS_PER_S": "fgtrack.core.time",
     "ObjectList": "fgtrack.inputs.formats.common",
     "RobustLoss": "fgtrack.models.sensors",
@@ -88,6 +90,7 @@ _HOMES = {
     "measurement_factor": "fgtrack.estimation.smoothing.gtsam.factors",
     "measurement_model": "fgtrack.models.measurement",
     "motion_factor": "fgtrack.estimation.smoothing.gtsam.factors",
+    "mounts": "fgtrack.meaning.public",
     "nanoseconds": "fgtrack.core.time",
     "open_input": "fgtrack.inputs.source",
     "plot": "fgtrack.show.figures",
@@ -180,7 +183,10 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.inputs.source import open_input as open_input
     from fgtrack.meaning.decision import Decision as Decision
     from fgtrack.meaning.draft import Draft as Draft
+    from fgtrack.meaning.mounts import MountEstimate as MountEstimate
+    from fgtrack.meaning.mounts import Mounts as Mounts
     from fgtrack.meaning.public import draft as draft
+    from fgtrack.meaning.public import mounts as mounts
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel
     from fgtrack.models.measurement import SensorPose as SensorPose
     from fgtrack.models.measurement import measured_position as measured_position

@@ -38,6 +38,8 @@ from fgtrack.meaning.corrected import corrected
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.draft import drafted
 from fgtrack.meaning.input_checks import TRIAL_S, input_checks, messages_within
+from fgtrack.meaning.placement import mounts_of, plain_mount
+from fgtrack.meaning.sample import SAMPLE_S
 from fgtrack.meaning.times import clock_constant
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
@@ -151,6 +153,7 @@ class Adviser:
             )
         self._take(self._stamps(sensors))
         self._take(self._input())
+        self._take(self._mounts())
         self._on_step("clocks", 0.1)
         self._take(self._offsets())
         seen = arrivals_of(
@@ -328,6 +331,31 @@ class Adviser:
         for one in [] if outcome is None else diagnostics(outcome.run):
             if one.about not in known and f"{one.text}." not in told:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
+
+    def _mounts(self) -> Iterator[Finding]:
+        """Yield mounts that differ from the configured ones, against other sensors or objects that stand still."""
+        if self._is_useless:
+            return
+        first = list(messages_within(self._tracked, nanoseconds(SAMPLE_S)))
+        lists = [item for item in first if isinstance(item, DetectionList)]
+        frames = {item.sensor: item.frame for item in lists if item.objects}
+        mounts = mounts_of(first, self._config)
+        for item in mounts.sensors:
+            if not item.is_off or not mounts.is_placed(item.sensor):
+                continue
+            reference = mounts.references[item.sensor]
+            source = (
+                f"relative to {reference}"
+                if reference != item.sensor
+                else "relative to objects that stand still"
+            )
+            key = f"sensors.{item.sensor}.mount"
+            text = f"its mount differs from the configured one. Estimated {source}: {item.words}."
+            settings = {key: plain_mount(item.significant_pose)}
+            if frames.get(item.sensor) != "sensor":
+                text += f" Set `frame: sensor` in its input, and {key} to this mount."
+                settings = {}
+            yield Finding("mount", item.sensor, 75.0, text, settings)
 
     def _offsets(self) -> Iterator[Finding]:
         """Yield clock offsets and position biases, if they can be estimated."""

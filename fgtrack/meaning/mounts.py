@@ -191,6 +191,19 @@ class Mounts:
     references: Mapping[str, str]
     """Reference of each sensor with an estimate: the sensor whose mount is assumed, unless still objects show it."""
 
+    known: frozenset[str] = frozenset()
+    """Sensors whose assumed mount counts as known: in the map, configured, or in the ego frame."""
+    in_map: frozenset[str] = frozenset()
+    """Sensors with detections in the map; they have no mount."""
+
+    def __contains__(self, sensor: str) -> bool:
+        return any(item.sensor == sensor for item in self.sensors)
+
+    def is_placed(self, sensor: str) -> bool:
+        """True if the mount of the sensor's reference is known, or still objects show it."""
+        reference = self.references.get(sensor, sensor)
+        return reference in self.known or self[reference].is_sure_of_yaw
+
     def __getitem__(self, sensor: str) -> MountEstimate:
         return next(item for item in self.sensors if item.sensor == sensor)
 
@@ -854,7 +867,12 @@ def estimated_mounts(
             at = assumed.get(name, Pose2())
             why = "too few of its detections recur, or the ego's pose is unknown"
             found[name] = MountEstimate(name, *at, _UNKNOWN, (0.0,) * 3, 0, why)
-    return Mounts(tuple(found[name] for name in sorted(found)), references)
+    return Mounts(
+        tuple(found[name] for name in sorted(found)),
+        references,
+        frozenset([*in_map, *preferred]),
+        frozenset(name for name, item in points.items() if item.in_map),
+    )
 
 
 def _group_estimates(

@@ -1,12 +1,13 @@
 """Decisions on frames and mounts: from header frames and tf, from the motion of objects, from other sensors."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
-from fgtrack.core.types import DetectionList, FloatArray
+from fgtrack.config.settings import Config
+from fgtrack.core.types import DetectionList, FloatArray, Message
 from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.inputs.ros.bag import Bag
 from fgtrack.inputs.ros.frames import BagFrames, FrameUse
@@ -17,7 +18,7 @@ from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
 from fgtrack.meaning.sample import Sample
 from fgtrack.meaning.tracklets import Points, points_of
 
-__all__ = ["frame_decisions", "mount_decisions"]
+__all__ = ["frame_decisions", "mount_decisions", "mounts_of", "plain_mount"]
 
 #: Messages of a topic whose header frames and heights are read.
 _MESSAGES = 50
@@ -138,7 +139,7 @@ def _topic_frame(
         x_m, y_m, yaw_rad = mount
         settings = {
             key: "sensor",
-            ("sensors", name, "mount"): _mount(Pose2(yaw_rad, x_m, y_m)),
+            ("sensors", name, "mount"): plain_mount(Pose2(yaw_rad, x_m, y_m)),
         }
         yield Decision(
             name, "mount", settings, "tested", f"tf gives the mount of {frame_id}"
@@ -235,16 +236,44 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     }
     if not paths:
         return
-    points, motion = points_of(sample.messages, sample.config.ego.detection_origin_m)
-    assumed = _assumed_mounts(sample, points)
-    known = _known_frames(sample, points)
-    mounts = estimated_mounts(points, motion, assumed, known)
+    mounts = mounts_of(sample.messages, sample.config)
     for name, path in paths.items():
-        if name not in points:
-            if _has_unknown_header(sample, name):
-                yield _unanswered(name, "it has no positions that the tests can use")
-        elif not points[name].in_map:
-            yield from _mount_decision(sample, mounts, name, path, known)
+        if name in mounts.in_map:
+            continue
+        if name in mounts:
+            yield from _mount_decision(sample, mounts, name, path)
+        elif _has_unknown_header(sample, name):
+            yield _unanswered(name, "it has no positions that the tests can use")
+
+
+def mounts_of(messages: Sequence[Message], config: Config) -> Mounts:
+    """Estimate the mounts of all sensors from the first minutes of `messages`, compared with those in `config`.
+
+    References are sensors in the map, then sensors with a configured mount, then
+    sensors with positions in the ego frame.
+    """
+    used = [
+        item
+        for item in messages
+        if not isinstance(item, DetectionList)
+        or item.sensor not in config.ignore_sensors
+    ]
+    points, motion = points_of(used, config.ego.detection_origin_m)
+    frames = {
+        item.sensor: item.frame for item in used if isinstance(item, DetectionList)
+    }
+    assumed = {}
+    for name in points:
+        mount = config.sensors[name].mount if name in config.sensors else None
+        if mount is not None and frames[name] == "sensor":
+            assumed[name] = Pose2(mount.yaw_rad, mount.x_m, mount.y_m)
+    size = {name: len(points[name].points_m) for name in points}
+    in_ego = [
+        name for name in points if frames[name] == "ego" and not points[name].is_polar
+    ]
+    known = [name for name in points if frames[name] == "map" or name in assumed]
+    known += sorted(in_ego, key=lambda name: (-size[name], name))
+    return estimated_mounts(points, motion, assumed, known)
 
 
 def _unanswered(name: str, why: str) -> Decision:
@@ -256,57 +285,20 @@ def _question(name: str) -> str:
     return f"where is it mounted? Set sensors.{name}.mount (x_m, y_m, yaw_rad)"
 
 
-def _assumed_mounts(sample: Sample, points: Mapping[str, Points]) -> dict[str, Pose2]:
-    """Return the configured mounts of sensors whose detections are in their own frame."""
-    frames = {
-        item.sensor: item.frame
-        for item in sample.messages
-        if isinstance(item, DetectionList)
-    }
-    result = {}
-    for name in points:
-        sensor = sample.config.sensors.get(name)
-        if sensor is not None and sensor.mount is not None and frames[name] == "sensor":
-            mount = sensor.mount
-            result[name] = Pose2(mount.yaw_rad, mount.x_m, mount.y_m)
-    return result
-
-
-def _known_frames(sample: Sample, points: Mapping[str, Points]) -> list[str]:
-    """Return the sensors with a known frame or mount, then those with positions in the ego frame by assumption."""
-    frames = {
-        item.sensor: item.frame
-        for item in sample.messages
-        if isinstance(item, DetectionList)
-    }
-    known = []
-    for name in points:
-        sensor = sample.config.sensors.get(name)
-        is_given = sensor is not None and sensor.mount is not None
-        if frames[name] == "map" or (frames[name] == "sensor" and is_given):
-            known.append(name)
-    size = {name: len(points[name].points_m) for name in points}
-    in_ego = [
-        name for name in points if frames[name] == "ego" and not points[name].is_polar
-    ]
-    return [*known, *sorted(in_ego, key=lambda name: (-size[name], name))]
-
-
 def _mount_decision(
     sample: Sample,
     mounts: Mounts,
     name: str,
     path: tuple[str, ...],
-    known: Sequence[str],
 ) -> Iterator[Decision]:
     """Yield the decision on the mount of one sensor."""
     item = mounts[name]
     reference = mounts.references.get(name, name)
-    is_placed = reference in known or mounts[reference].is_sure_of_yaw
+    is_placed = mounts.is_placed(name)
     against = "" if reference == name else f"against {reference}: "
     if _is_read_in_ego(sample, name):
         # The recording itself puts the sensor into the ego, so nothing is changed.
-        if item.is_off and reference in known and reference != name:
+        if item.is_off and is_placed and reference != name:
             reason = (
                 f"its header puts it into the ego's frame, but {against}{item.words}"
             )
@@ -315,7 +307,7 @@ def _mount_decision(
     if item.is_off and is_placed:
         frame = "optical" if _mapping_frame(sample, name) == "optical" else "sensor"
         settings = {
-            ("sensors", name, "mount"): _mount(item.significant_pose),
+            ("sensors", name, "mount"): plain_mount(item.significant_pose),
             (*path, "frame"): frame,
         }
         question = (
@@ -362,7 +354,7 @@ def _has_unknown_header(sample: Sample, name: str) -> bool:
     )
 
 
-def _mount(pose: Pose2) -> dict[str, float]:
+def plain_mount(pose: Pose2) -> dict[str, float]:
     """Plain values of a mount, rounded."""
     return {
         "x_m": round(pose.x_m, 2),

@@ -1,10 +1,16 @@
-"""Draft of a recording's settings as a function: `fgtrack.draft`."""
+"""Meaning of a recording as functions: `fgtrack.draft` and `fgtrack.mounts`."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 from fgtrack.config.reading import ConfigLike, read_config
-from fgtrack.meaning.draft import Draft, drafted
+from fgtrack.core.time import nanoseconds
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.meaning.draft import Draft, drafted, opened
+from fgtrack.meaning.input_checks import messages_within
+from fgtrack.meaning.mounts import Mounts
+from fgtrack.meaning.placement import mounts_of
+from fgtrack.meaning.sample import SAMPLE_S
 
 
 def draft(
@@ -27,3 +33,25 @@ def draft(
     cannot be read.
     """
     return drafted(recording, read_config(config, set, track_map=map, pit_map=pit_map))
+
+
+def mounts(
+    recording: str | Path,
+    config: ConfigLike | None = None,
+    *,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+) -> Mounts:
+    """Estimate yaw and lever arm of each sensor in the ego, with 95 % intervals, from the first two minutes.
+
+    `mounts["radar"]` has `yaw_rad`, `x_m`, `y_m`, their `half_widths`, and `is_off`: true
+    if the mount differs significantly from the one in `config` (or from the origin of
+    the ego). The mounts are relative to a reference sensor, whose own mount is assumed
+    unless objects that stand still show it. `print` gives the result in words.
+
+    Raises `CallError` for an invalid configuration, and `DataError` for a recording that
+    cannot be read.
+    """
+    draft = opened(recording, read_config(config, set))
+    readable = UntilBreak(draft.source.messages())
+    first = list(messages_within(readable, nanoseconds(SAMPLE_S)))
+    return mounts_of(first, draft.config)
