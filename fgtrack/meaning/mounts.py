@@ -55,6 +55,9 @@ _CONVERGED = 1e-3
 _FEWEST_DOF = 1.0
 #: Share of the information that the data must carry.
 _CARRIED = 0.5
+#: Standard deviation of the detected points of a hull, and degrees of freedom of objects that show that they differ.
+_HULL_M = 1.0
+_FEWEST_OBJECTS_DOF = 1.5
 #: Largest chance at which a jackknife over other clusters counts as larger.
 _LARGER = 0.05
 #: Speed of an object that may stand still, its shortest observation, and the slowest ego that shows it.
@@ -95,6 +98,8 @@ class Pose2(NamedTuple):
         return np.asarray(points_m @ rotation(self.yaw_rad).T + self.shift_m)
 
 
+IN_MAP = "its detections are in the map"
+"""Reason of a sensor without a mount."""
 _UNKNOWN = (math.inf, math.inf, math.inf)
 
 
@@ -153,6 +158,8 @@ class MountEstimate:
     def words(self) -> str:
         """Yaw and lever arm with their 95 % intervals in words, and the data behind them."""
         yaw, x, y = self.half_widths
+        if self.why == IN_MAP:
+            return IN_MAP
         return (
             f"yaw {_within(math.degrees(self.yaw_rad), math.degrees(yaw), 'degrees')}, "
             f"x {_within(self.x_m, x, 'm')}, y {_within(self.y_m, y, 'm')} ({self.why})"
@@ -712,10 +719,13 @@ def _solved(
             break
     L = _absolute(poses, root, size)[:, used]
     first = np.flatnonzero(np.diff(table.runs, prepend=-1))
+    hulls = np.full(size, _HULL_M)
+    hulls[: 3 * count : 3] /= max(float(np.median(np.hypot(*table.points_m.T))), 1.0)
     std, dof = _spread(
         (fit.H[:, used][:, :, used], fit.g[:, used], prior[used], L),
         table.stretches[first],
         table.objects[first],
+        hulls,
     )
     num_still = len(np.unique(table.objects[still]))
     return _Solution(root, poses, radial_m, std, dof, num_still)
@@ -779,12 +789,14 @@ _System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def _spread(
-    system: _System, stretches: IntArray, objects: IntArray
+    system: _System, stretches: IntArray, objects: IntArray, hulls: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations and degrees of freedom: a jackknife over stretches, longer stretches, and objects.
 
     Errors may be correlated over longer times, or along each object. Then the jackknife
-    over those clusters is significantly larger, and counts.
+    over those clusters is significantly larger, and counts. One or two objects cannot
+    show that their hulls are no cause. Then `hulls`, the usual standard deviation of the
+    detected points of a hull, is added.
     """
     from scipy.special import fdtrc
 
@@ -797,7 +809,9 @@ def _spread(
         larger = known & (chance < _LARGER)
         std = np.where(larger, other, std)
         dof = np.where(larger, other_dof, dof)
-    return std, dof
+    few = other_dof < _FEWEST_OBJECTS_DOF
+    share = np.square(hulls) / (1.0 + np.maximum(other_dof, 0.0))
+    return np.where(few, np.sqrt(np.square(std) + share), std), dof
 
 
 def _jackknife(system: _System, clusters: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -896,9 +910,8 @@ def _group_estimates(
     result = []
     for k, name in enumerate(names):
         if sensors[name].points.in_map:
-            why = "its detections are in the map"
             result.append(
-                MountEstimate(name, 0.0, 0.0, 0.0, (0.0,) * 3, (0.0,) * 3, 0, why)
+                MountEstimate(name, 0.0, 0.0, 0.0, (0.0,) * 3, (0.0,) * 3, 0, IN_MAP)
             )
             continue
         pose = best.poses[k].after(best.root)

@@ -1,10 +1,11 @@
 """Meaning of a recording as functions: `fgtrack.draft` and `fgtrack.mounts`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import Message
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.meaning.draft import Draft, drafted, opened
 from fgtrack.meaning.input_checks import messages_within
@@ -36,7 +37,7 @@ def draft(
 
 
 def mounts(
-    recording: str | Path,
+    recording: str | Path | Iterable[Message],
     config: ConfigLike | None = None,
     *,
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
@@ -47,11 +48,18 @@ def mounts(
     if the mount differs significantly from the one in `config` (or from the origin of
     the ego). The mounts are relative to a reference sensor, whose own mount is assumed
     unless objects that stand still show it. `print` gives the result in words.
+    `recording` is a path, or messages in the order of their receipt.
 
     Raises `CallError` for an invalid configuration, and `DataError` for a recording that
     cannot be read.
     """
-    draft = opened(recording, read_config(config, set))
-    readable = UntilBreak(draft.source.messages())
-    first = list(messages_within(readable, nanoseconds(SAMPLE_S)))
-    return mounts_of(first, draft.config)
+    resolved = read_config(config, set)
+    messages: Iterable[Message]
+    if isinstance(recording, str | Path):
+        draft = opened(recording, resolved)
+        resolved = draft.config
+        messages = UntilBreak(draft.source.messages())
+    else:
+        messages = recording
+    first = list(messages_within(messages, nanoseconds(SAMPLE_S)))
+    return mounts_of(first, resolved)

@@ -11,9 +11,9 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.meaning.frames import frame_of, is_optical
 from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
 from fgtrack.meaning.tracklets import points_of, tracklets
-from tests.support.drives import drives
+from tests.support.scripts import load
 
-DRIVES = drives()
+DRIVES = load("mounts", "drives")
 Sensor = DRIVES.Sensor
 
 
