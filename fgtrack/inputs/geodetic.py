@@ -45,6 +45,7 @@ class LocalPlane:
         self.origin = origin
         self._num_near = 0
         self._num_far = 0
+        self._warned = False
 
     @property
     def origin_deg(self) -> tuple[float, float] | None:
@@ -90,7 +91,9 @@ class LocalPlane:
             self._num_near += 1
         else:
             self._num_far += 1
-            if self._num_far >= max(_FEWEST_FAR, _FAR_SHARE * self._num_near):
+            limit = max(_FEWEST_FAR, _FAR_SHARE * self._num_near)
+            if not self._warned and self._num_far >= limit:
+                self._warned = True
                 where = f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}"
                 warn_once(
                     f"positions are {where}: set `input.origin` within 100 km of the positions"

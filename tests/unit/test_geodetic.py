@@ -79,9 +79,11 @@ def test_far_positions_warn_once(caplog):
         for _ in range(20):
             plane.position_m(here.latitude_deg + 0.85, here.longitude_deg)
         assert not caplog.records
-        for _ in range(12):
-            plane.position_m(here.latitude_deg + 1.0, here.longitude_deg)
-            opened_again.position_m(here.latitude_deg + 1.0, here.longitude_deg)
+        for k in range(12):
+            # The distance of later positions does not matter.
+            at_deg = here.latitude_deg + 1.0 + 0.01 * max(k - 9, 0)
+            plane.position_m(at_deg, here.longitude_deg)
+            opened_again.position_m(at_deg, here.longitude_deg)
     assert [record.message for record in caplog.records] == [
         "positions are 111 km from the origin 41.2000, 2.0800: set `input.origin` within 100 km of the positions"
     ]
