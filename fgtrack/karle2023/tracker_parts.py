@@ -317,7 +317,7 @@ class PublishedLifecycle(CountingLifecycle):
     ) -> None:
         """See `CountingLifecycle.matched`."""
         for row in self._rows.of([states.track_ids[track] for _, track in pairs]):
-            counters = self._counters[row]
+            counters = self._arrays[0][row]
             if counters[COUNTER] < self._rules.counter_cap:
                 counters[COUNTER] += self._sensors[scan.sensor].counter_add
             counters[LAST_SEEN], counters[MISSES] = scan.stamp_ns, 0
@@ -328,7 +328,7 @@ class PublishedLifecycle(CountingLifecycle):
         return super()._ages(sensor, ranges_m)
 
     def _ends(self, rows: IntArray, scan: Scan) -> BoolArray:
-        counters = self._counters[rows]
+        counters = self._arrays[0][rows]
         is_old = scan.present_ns - counters[:, LAST_SEEN] > self._forget_ns
         return np.asarray((counters[:, COUNTER] <= 0) | is_old)
 

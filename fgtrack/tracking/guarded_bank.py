@@ -145,9 +145,11 @@ class GuardedBank(Stateful):
 
         A propagated exception and an interrupt leave states unknown, so they end all tracks of the call.
         """
-        ids = [track_id for track_id in track_ids if track_id in self._alive]
+        ids = track_ids
         given = set(ids)
-        if len(ids) < len(track_ids):
+        if not given <= self._alive.keys():
+            ids = [track_id for track_id in track_ids if track_id in self._alive]
+            given = set(ids)
             measurements = [
                 each
                 for track_id, each in zip(track_ids, measurements, strict=True)
@@ -160,10 +162,11 @@ class GuardedBank(Stateful):
             if isinstance(error, DataError) or not isinstance(error, Exception):
                 raise
             answers = {}
-        results = [
-            answers.get(track_id) or UpdateResult(UpdateStatus.FAILED)
-            for track_id in track_ids
-        ]
+        found = list(map(answers.get, track_ids))
+        results = [each for each in found if each]
+        if len(results) == len(found) and None not in [each.nis for each in results]:
+            return results
+        results = [each or UpdateResult(UpdateStatus.FAILED) for each in found]
         for track_id, result in zip(track_ids, results, strict=True):
             if result.nis is None and result.status is UpdateStatus.FAILED:
                 self.failures.add(Failure.UPDATE_FAILED)

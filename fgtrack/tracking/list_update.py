@@ -110,17 +110,16 @@ class ListUpdate:
         The outcomes of `pairs` (m,) are noted. The measurements give positions where they are `placed`.
         """
         track_ids, measurements = states.track_ids, Measurements(stack)
-        ids = [track_ids[track] for track in of.tolist()]
+        ids = list(map(track_ids.__getitem__, of.tolist()))
         results = self._parts.bank.update(stack.stamp_ns, ids, measurements)
         made = zip(repeat(stack), results)
         outcomes.update(zip(pairs.tolist(), made, strict=True))
-        num_measured = self._tracks.num_measured
-        for track_id, result in zip(ids, results, strict=True):
-            if result.innovation is not None:
-                num_measured[track_id] += 1
+        fused = [row for row, each in enumerate(results) if each.innovation is not None]
+        for row in fused:
+            self._tracks.num_measured[ids[row]] += 1
         if is_placed:
             try:
-                self._tracks.placed(measurements, of, states, results)
+                self._tracks.placed(ids, fused, measurements, of, states, results)
             except Exception as error:
                 self._parts.contain(error, Failure.STEP_FAILED)
 

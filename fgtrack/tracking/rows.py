@@ -1,6 +1,6 @@
 """Rows of arrays that hold one track each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import ClassVar
 
 import numpy as np
@@ -40,11 +40,11 @@ class TrackRows(Stateful):
             self._every = np.array([*self.by_id.values()], dtype=np.int64)
         return self._every
 
-    def of(self, track_ids: Sequence[int]) -> IntArray:
+    def of(self, track_ids: Iterable[int]) -> IntArray:
         """Return the rows of tracks, shape (m,). The rows of the last call are kept for the same tracks."""
         ids = tuple(track_ids)
         if ids != self._ids:
-            rows = np.array([self.by_id[each] for each in ids], dtype=np.int64)
+            rows = np.array([*map(self.by_id.__getitem__, ids)], dtype=np.int64)
             self._ids, self._rows = ids, rows
         return self._rows
 

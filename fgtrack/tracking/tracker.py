@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -179,12 +180,12 @@ class MultiObjectTracker:
         """
         self._tick += 1
         parts, bank = self._parts, self._parts.bank
-        self._fail_rest()  # of a tick that was interrupted
+        if self._begun is not None:  # of a tick that was interrupted
+            self._fail_rest()
         self._collect(now_ns, None if is_last else parts.wait)
         held_ns = parts.inbox.held_ns
-        self._expire(
-            now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)])
-        )
+        stamps_ns = map(attrgetter("stamp_ns"), self._waiting)
+        self._expire(now_ns, min([held_ns, *stamps_ns]))
         bank.advance(now_ns)
         try:
             parts.ego.start_tick()

@@ -118,21 +118,19 @@ class Tracks(Stateful):
 
     def placed(
         self,
+        ids: Sequence[int],
+        fused: Sequence[int],
         measurements: Measurements,
         of: IntArray,
         states: StatesAt,
         results: Sequence[UpdateResult],
     ) -> None:
-        """Count the fused ones of these measurements, which give positions, for the lives of their tracks.
+        """Count the `fused` rows of these measurements, which give positions, for the lives of the tracks `ids` (m,).
 
         `of` (m,) are the indices of the tracks in `states`.
         """
-        ids = [states.track_ids[track] for track in of.tolist()]
-        fused = [row for row, each in enumerate(results) if each.innovation is not None]
-        if len(fused) == len(ids):
-            self._parts.lifecycle.fused(ids)
-        else:
-            self._parts.lifecycle.fused([ids[row] for row in fused])
+        is_all = len(fused) == len(ids)
+        self._parts.lifecycle.fused(ids if is_all else [ids[row] for row in fused])
         if not (self._newborn or self._directed or self._undirected):
             return
         stamp_ns = measurements.stack.stamp_ns

@@ -5,6 +5,8 @@ import numpy as np
 from fgtrack.core.compiled import check, check_rows, inlined, njit
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.tracking.lives.counters import (
+    COASTING,
+    CONFIRMED,
     COUNTER,
     ENDS,
     JUDGED,
@@ -13,7 +15,9 @@ from fgtrack.tracking.lives.counters import (
     MISSES,
     NUM_CHANGES,
     NUM_COLUMNS,
+    NUM_PLACED,
     SETTLED,
+    TENTATIVE,
 )
 from fgtrack.tracking.lives.latency import FOREVER
 from fgtrack.tracking.lives.latency_kernels import decided_ns
@@ -196,6 +200,29 @@ def miss(
             counters[own, MISSES] += 1
             _change(own, stamp_ns, 1, most, awaits, counters, changes)
     return True
+
+
+@njit("void(int64[::1], int64[:, ::1])")
+def place(rows: IntArray, counters: IntArray) -> None:
+    """Count a measurement that has changed the position of each track in `rows`."""
+    check_rows(rows, 0, len(counters))
+    check(counters.shape[1] == NUM_COLUMNS)
+    for i in range(len(rows)):
+        counters[rows[i], NUM_PLACED] += 1
+
+
+@njit("int64[::1](int64[::1], int64, int64[:, ::1])")
+def report(rows: IntArray, confirm_count: int, counters: IntArray) -> IntArray:
+    """Return the statuses of the tracks in `rows`: `TENTATIVE`, `CONFIRMED` or `COASTING`, shape (m,)."""
+    check_rows(rows, 0, len(counters))
+    check(counters.shape[1] == NUM_COLUMNS)
+    statuses = np.empty(len(rows), dtype=np.int64)
+    for i in range(len(rows)):
+        own = rows[i]
+        statuses[i] = COASTING if counters[own, MISSES] else CONFIRMED
+        if counters[own, NUM_PLACED] < confirm_count:
+            statuses[i] = TENTATIVE
+    return statuses
 
 
 @njit(

@@ -49,6 +49,9 @@ class Scan(NamedTuple):
 #: - newest stamp for which it is known which sensors could show the object
 COUNTER, LAST_SEEN, NUM_PLACED, MISSES, SETTLED, NUM_CHANGES, ENDS, JUDGED = range(8)
 NUM_COLUMNS = 8
+#: Numbers of the statuses in compiled loops.
+TENTATIVE, CONFIRMED, COASTING = range(3)
+STATUSES = TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.COASTING
 #: Changes from which on those that no late list can precede are settled.
 MANY_CHANGES = 16
 _FEWEST_CHANGES = 32
@@ -105,10 +108,7 @@ class CountingLifecycle(Stateful):
     STATE: ClassVar[tuple[str, ...]] = (
         "_watermarks_ns",
         "_rows",
-        "_counters",
-        "_changes",
-        "_could_show",
-        "_expected_ns",
+        "_arrays",
     )
 
     birth_probability = 0.5
@@ -129,51 +129,48 @@ class CountingLifecycle(Stateful):
         self._views = Views(sensors, detection_origin_m)
         self._watermarks_ns = np.full(len(sensors), FOREVER)
         self._rows = TrackRows()
-        self._counters: IntArray = np.zeros((0, NUM_COLUMNS), dtype=np.int64)
-        """Shape (tracks, columns)."""
-        self._changes: IntArray = np.zeros((0, _FEWEST_CHANGES, 2), dtype=np.int64)
-        """Stamps of matches and misses that are not settled, ascending, and decrements of the counter."""
-        self._could_show: BoolArray = np.zeros((0, len(sensors)), dtype=bool)
-        """True if the sensor could show the object at the newest stamp for which that is known, (tracks, sensors)."""
-        self._expected_ns: IntArray = np.zeros((0, len(sensors)), dtype=np.int64)
-        """Newest stamp at which the sensor could show the object, shape (tracks, sensors)."""
+        self._arrays: tuple[IntArray, IntArray, BoolArray, IntArray] = (
+            np.zeros((0, NUM_COLUMNS), dtype=np.int64),
+            np.zeros((0, _FEWEST_CHANGES, 2), dtype=np.int64),
+            np.zeros((0, len(sensors)), dtype=bool),
+            np.zeros((0, len(sensors)), dtype=np.int64),
+        )
+        """Counters, shape (tracks, columns). Stamps of matches and misses that are not settled, ascending, and
+        decrements of the counter, shape (tracks, changes, 2). By sensor, shapes (tracks, sensors): true if the sensor
+        could show the object at the newest stamp for which that is known, and the newest stamp at which it could."""
 
     @property
     def lives(self) -> dict[int, Life]:
         """Copies of the counters by track id."""
         return {
-            track_id: Life(*self._counters[row, :ENDS].tolist())
+            track_id: Life(*self._arrays[0][row, :ENDS].tolist())
             for track_id, row in self._rows.by_id.items()
         }
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """A detection started a track."""
-        if self._rows.following >= len(self._counters):
-            self._allocate(2 * len(self._counters) or FEWEST, self._changes.shape[1])
+        num_tracks, num_changes, _ = self._arrays[1].shape
+        if self._rows.following >= num_tracks:
+            self._allocate(2 * num_tracks or FEWEST, num_changes)
         counter, stamp_ns = self._sensors[scan.sensor].counter_init, scan.stamp_ns
         could_show = self._views.at_birth(
             candidate.position_m, scan.ego, self._index[scan.sensor]
         )
         row = self._rows.begin(track_id)
-        self._counters[row] = counter, stamp_ns, 1, 0, counter, 0, FOREVER, stamp_ns
-        self._could_show[row] = could_show
-        self._expected_ns[row] = np.where(could_show, stamp_ns, NEVER)
+        counters, _, could, expected_ns = self._arrays
+        counters[row] = counter, stamp_ns, 1, 0, counter, 0, FOREVER, stamp_ns
+        could[row], expected_ns[row] = could_show, np.where(could_show, stamp_ns, NEVER)
 
     def _allocate(self, num_tracks: int, num_changes: int) -> None:
         """Make larger arrays with the present contents; all are allocated before one is replaced."""
-        tracks, changes, _ = self._changes.shape
+        tracks, changes, _ = self._arrays[1].shape
         counters = np.zeros((num_tracks, NUM_COLUMNS), dtype=np.int64)
         more = np.zeros((num_tracks, num_changes, 2), dtype=np.int64)
         could_show = np.zeros((num_tracks, len(self._sensors)), dtype=bool)
         expected_ns = np.zeros((num_tracks, len(self._sensors)), dtype=np.int64)
-        counters[:tracks], more[:tracks, :changes] = self._counters, self._changes
-        could_show[:tracks], expected_ns[:tracks] = self._could_show, self._expected_ns
-        self._counters, self._changes = counters, more
-        self._could_show, self._expected_ns = could_show, expected_ns
-
-    @property
-    def _arrays(self) -> tuple[IntArray, IntArray, BoolArray, IntArray]:
-        return self._counters, self._changes, self._could_show, self._expected_ns
+        counters[:tracks], more[:tracks, :changes] = self._arrays[:2]
+        could_show[:tracks], expected_ns[:tracks] = self._arrays[2:]
+        self._arrays = counters, more, could_show, expected_ns
 
     def matched(
         self,
@@ -193,11 +190,12 @@ class CountingLifecycle(Stateful):
         """Call a compiled loop that adds one change to tracks, in larger arrays where room is missing."""
         most, awaits = self._rules.counter_cap, self._awaits
         while not function(*change, most, awaits, *self._arrays):
-            self._allocate(len(self._counters), 2 * self._changes.shape[1])
+            num_tracks, num_changes, _ = self._arrays[1].shape
+            self._allocate(num_tracks, 2 * num_changes)
 
     def fused(self, track_ids: Sequence[int]) -> None:
         """The associated detections, which give positions, changed the states."""
-        self._counters[self._rows.of(track_ids), NUM_PLACED] += 1
+        kernels(_KERNELS).place(self._rows.of(track_ids), self._arrays[0])
 
     def missed(
         self,
@@ -223,7 +221,7 @@ class CountingLifecycle(Stateful):
     def _ends(self, rows: IntArray, scan: Scan) -> BoolArray:
         """True of the tracks in `rows` that end at a list that misses them, shape (m,)."""
         if not self._awaits:
-            return np.asarray(self._counters[rows, COUNTER] <= 0)
+            return np.asarray(self._arrays[0][rows, COUNTER] <= 0)
         ended: BoolArray = kernels(_KERNELS).ended(
             rows, self._watermarks_ns, scan.stamp_ns, *self._arrays
         )
@@ -244,7 +242,7 @@ class CountingLifecycle(Stateful):
             self._watermarks_ns = watermarks_ns
         rows = self._rows.every
         if not self._awaits:
-            ended = present_ns - self._counters[rows, LAST_SEEN] > self._forget_ns
+            ended = present_ns - self._arrays[0][rows, LAST_SEEN] > self._forget_ns
             return list(compress(self._rows.by_id, ended.tolist()))
         ended = np.empty(len(rows), dtype=bool)
         number = kernels(_KERNELS).expire(
@@ -277,13 +275,7 @@ class CountingLifecycle(Stateful):
         self, track_ids: Sequence[int]
     ) -> tuple[list[TrackStatus], Sequence[float | None]]:
         """Return the statuses of tracks, and the probabilities that their objects exist: None, as counts give none."""
-        counters = self._counters[self._rows.of(track_ids)]
-        statuses = [
-            TrackStatus.TENTATIVE
-            if num_placed < self._rules.confirm_count
-            else TrackStatus.COASTING
-            if misses
-            else TrackStatus.CONFIRMED
-            for num_placed, misses in counters[:, NUM_PLACED : MISSES + 1].tolist()
-        ]
-        return statuses, [None] * len(statuses)
+        codes = kernels(_KERNELS).report(
+            self._rows.of(track_ids), self._rules.confirm_count, self._arrays[0]
+        )
+        return [STATUSES[code] for code in codes.tolist()], [None] * len(codes)

@@ -34,7 +34,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Pairs, assigned, near
-from fgtrack.tracking.lives.counters import CountingLifecycle, Scan
+from fgtrack.tracking.lives.counters import STATUSES, CountingLifecycle, Scan
 from fgtrack.tracking.lives.latency import FOREVER, NEVER, Views
 from fgtrack.tracking.lives.visibility import Histories
 from fgtrack.tracking.preprocess import Candidate, Candidates
@@ -47,10 +47,8 @@ NUM_LIFE = 4
 #: Columns of its flags: it was ever confirmed, and was as far from its first position as it must be.
 IS_CONFIRMED, IS_TRAVELLED = range(2)
 NUM_FLAGS = 2
-#: Verdicts, and statuses, as the kernels number them.
+#: Numbers of the verdicts in compiled loops.
 STAYS, ENDS, SUSPENDED = range(3)
-TENTATIVE, CONFIRMED, COASTING = range(3)
-_STATUSES = TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.COASTING
 _KERNELS = "fgtrack.tracking.lives.existence_kernels"
 
 
@@ -132,11 +130,8 @@ class ExistenceLifecycle(Stateful):
         "_suspended",
         "_histories",
         "_rows",
-        "_lives",
-        "_flags",
+        "_arrays",
         "_first_m",
-        "_could_show",
-        "_expected_ns",
         "_matches",
     )
 
@@ -167,15 +162,16 @@ class ExistenceLifecycle(Stateful):
             len(sensors), rules.lifetime_s, rules.visible_share, rules.visible_s
         )
         self._rows = TrackRows()
-        self._lives: IntArray = np.zeros((0, NUM_LIFE), dtype=np.int64)
-        self._flags: BoolArray = np.zeros((0, NUM_FLAGS), dtype=bool)
-        """Shapes (tracks, columns)."""
         self._first_m: FloatArray = np.zeros((0, 2))
         """First positions, shape (tracks, 2)."""
-        self._could_show: BoolArray = np.zeros((0, len(sensors)), dtype=bool)
-        """True if the sensor could show the object at the newest stamp for which that is known, (tracks, sensors)."""
-        self._expected_ns: IntArray = np.zeros((0, len(sensors)), dtype=np.int64)
-        """Newest stamp at which the sensor could show the object, shape (tracks, sensors)."""
+        self._arrays: tuple[IntArray, BoolArray, BoolArray, IntArray] = (
+            np.zeros((0, NUM_LIFE), dtype=np.int64),
+            np.zeros((0, NUM_FLAGS), dtype=bool),
+            np.zeros((0, len(sensors)), dtype=bool),
+            np.zeros((0, len(sensors)), dtype=np.int64),
+        )
+        """Lives and flags, shapes (tracks, columns). By sensor, shapes (tracks, sensors): true if the sensor could show
+        the object at the newest stamp for which that is known, and the newest stamp at which the sensor could."""
         self._matches: list[_Matches] = []  # that are not in the histories yet
         own = sensors.values()
         self._P_D = np.array([each.detection_probability for each in own])
@@ -189,36 +185,33 @@ class ExistenceLifecycle(Stateful):
         )
         own, stamp_ns = self._index[scan.sensor], scan.stamp_ns
         could_show = self._views.at_birth(candidate.position_m, scan.ego, own)
-        if self._rows.following >= len(self._lives):
-            self._allocate(2 * len(self._lives) or FEWEST)
+        if self._rows.following >= len(self._first_m):
+            self._allocate(2 * len(self._first_m) or FEWEST)
         self._histories.begin(self._rows.following, stamp_ns, own, log_odds)
         row = self._rows.begin(track_id)
-        self._lives[row] = 0, stamp_ns, stamp_ns, stamp_ns
+        lives, flags, could, expected_ns = self._arrays
+        lives[row] = 0, stamp_ns, stamp_ns, stamp_ns
         has_travelled = self._rules.min_travel_m == 0.0
         exists = self._histories.present(np.array([row]), stamp_ns)[0]
         is_confirmed = has_travelled and exists >= self._rules.confirm_probability
-        self._flags[row] = is_confirmed, has_travelled
+        flags[row] = is_confirmed, has_travelled
         self._first_m[row] = candidate.position_m
-        self._could_show[row] = could_show
-        self._expected_ns[row] = np.where(could_show, stamp_ns, NEVER)
+        could[row], expected_ns[row] = could_show, np.where(could_show, stamp_ns, NEVER)
 
     def _allocate(self, num_tracks: int) -> None:
         """Make larger arrays with the present contents; all are allocated before one is replaced."""
-        present, num_sensors = len(self._lives), len(self._sensors)
-        lives = np.zeros((num_tracks, NUM_LIFE), dtype=np.int64)
-        flags = np.zeros((num_tracks, NUM_FLAGS), dtype=bool)
+        present, num_sensors = len(self._first_m), len(self._sensors)
         first_m = np.zeros((num_tracks, 2))
-        could_show = np.zeros((num_tracks, num_sensors), dtype=bool)
-        expected_ns = np.zeros((num_tracks, num_sensors), dtype=np.int64)
-        lives[:present], flags[:present] = self._lives, self._flags
-        first_m[:present], could_show[:present] = self._first_m, self._could_show
-        expected_ns[:present] = self._expected_ns
-        self._lives, self._flags, self._first_m = lives, flags, first_m
-        self._could_show, self._expected_ns = could_show, expected_ns
-
-    @property
-    def _arrays(self) -> tuple[IntArray, BoolArray, BoolArray, IntArray]:
-        return self._lives, self._flags, self._could_show, self._expected_ns
+        arrays = (
+            np.zeros((num_tracks, NUM_LIFE), dtype=np.int64),
+            np.zeros((num_tracks, NUM_FLAGS), dtype=bool),
+            np.zeros((num_tracks, num_sensors), dtype=bool),
+            np.zeros((num_tracks, num_sensors), dtype=np.int64),
+        )
+        first_m[:present] = self._first_m
+        for more, own in zip(arrays, self._arrays, strict=True):
+            more[:present] = own
+        self._arrays, self._first_m = arrays, first_m
 
     def matched(
         self,
@@ -228,11 +221,13 @@ class ExistenceLifecycle(Stateful):
         states: StatesAt,
     ) -> None:
         """See `CountingLifecycle.matched`."""
-        placed = [pair for pair in pairs if candidates.placed[pair[0]]]
+        placed = pairs
+        if not all(candidates.placed):
+            placed = [pair for pair in pairs if candidates.placed[pair[0]]]
         if not placed:
             return
         chosen, tracks = np.array(placed).T
-        rows = self._rows.of([states.track_ids[track] for _, track in placed])
+        rows = self._rows.of(map(states.track_ids.__getitem__, tracks.tolist()))
         scores = self._scores(scan, candidates, placed)
         points_m = candidates.lines.take(chosen, axis=0)[:, :2]
         means_m = states.means.take(tracks, axis=0)[:, :2]
@@ -245,8 +240,8 @@ class ExistenceLifecycle(Stateful):
         """Add the matches since the last time to the histories: of lists of one detection each, many at once."""
         if not self._matches:
             return
-        counts = [len(each.rows) for each in self._matches]
         tracks, stamps, of, *others = zip(*self._matches, strict=True)
+        counts = list(map(len, tracks))
         rows, stamps_ns, sensors = (
             np.concatenate(tracks),
             np.repeat(stamps, counts),
@@ -367,7 +362,7 @@ class ExistenceLifecycle(Stateful):
         known = self._watermarks_ns, self._processed_ns, self._present_ns
         history = self._rules.doubt_probability, *self._arrays, *self._histories.arrays
         kernels(_KERNELS).report(rows, *known, *history, codes, exists)
-        return [_STATUSES[code] for code in codes.tolist()], exists.tolist()
+        return [STATUSES[code] for code in codes.tolist()], exists.tolist()
 
     def _learn(
         self,

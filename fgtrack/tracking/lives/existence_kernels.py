@@ -6,9 +6,8 @@ import numpy as np
 
 from fgtrack.core.compiled import check, check_rows, inlined, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.tracking.lives.counters import COASTING, CONFIRMED, TENTATIVE
 from fgtrack.tracking.lives.existence import (
-    COASTING,
-    CONFIRMED,
     ENDS,
     IN_VIEW,
     IS_CONFIRMED,
@@ -19,7 +18,6 @@ from fgtrack.tracking.lives.existence import (
     NUM_LIFE,
     STAYS,
     SUSPENDED,
-    TENTATIVE,
     VISIBLE,
 )
 from fgtrack.tracking.lives.latency import NEVER
