@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, DataError, FgtrackError
-from fgtrack.core.types import Message
+from fgtrack.core.types import EgoState, Message
 from fgtrack.inputs.formats.native import NATIVE_ADAPTERS
 from fgtrack.inputs.formats.tables import headers
 from fgtrack.inputs.info import describe
@@ -20,7 +21,8 @@ from fgtrack.inputs.settings import CsvInput, CsvTable, InputConfig, TopicInput
 from fgtrack.inputs.source import InputSource, input_kind, open_input
 from fgtrack.meaning.assumed import assumed, unmodelled_sensors
 from fgtrack.meaning.assumption import Assumed, departures
-from fgtrack.meaning.decision import Decision
+from fgtrack.meaning.decision import Certainty, Decision
+from fgtrack.meaning.ego_choice import with_consistent_ego
 from fgtrack.meaning.evidence import decided
 from fgtrack.meaning.guess import words_of
 from fgtrack.meaning.parts import EGO_WORDS, InputPart
@@ -255,7 +257,8 @@ def _role(part: InputPart) -> Decision:
     """Return the decision on the role of a part."""
     reason = f"{part.label} is read as {part.role}, by its name, type and values"
     settings = {part.path: departures(part.item)}
-    return Decision(part.role, "role", settings, "assumed", reason)
+    certainty: Certainty = "tested" if part.role_reason else "assumed"
+    return Decision(part.role, "role", settings, certainty, part.role_reason or reason)
 
 
 def _unreadable(path: Path, kind: str, unused: Sequence[str]) -> InputSource:
@@ -276,6 +279,7 @@ def _mapped(path: Path, kind: str) -> tuple[list[InputPart], tuple[str, ...]]:
     if kind == "csv" and (part := report_part(path)) is not None:
         return [part], ()
     parts, unused = _parts(path, kind)
+    parts = with_consistent_ego(parts, partial(_ego_states, path))
     taken = _readable(path, parts, unused)
     return taken, tuple(unused)
 
@@ -337,6 +341,15 @@ def _readable(
         except FgtrackError as error:
             refused.append(f"{guess}: {error}")
     return taken
+
+
+def _ego_states(path: Path, part: InputPart) -> Iterator[EgoState]:
+    """Yield the states of the ego that `part` gives, up to a break."""
+    with suppress(FgtrackError):
+        source = open_input(path, _with_parts(InputConfig(), [part]))
+        for message in source.messages():
+            if isinstance(message, EgoState):
+                yield message
 
 
 def _with_parts(config: InputConfig, parts: Sequence[InputPart]) -> InputConfig:

@@ -77,6 +77,8 @@ class InputPart:
     """Notes on unused fields, and on settings to check."""
     rank: int = 0
     """Rank among several parts with one role: the lowest is used."""
+    role_reason: str = ""
+    """Reason of the role if a test chose this part; else empty."""
 
     @property
     def label(self) -> str:
