@@ -1,6 +1,7 @@
-"""Compilation of loops by numba, kept on disk where a folder can be written, and loops over small dense matrices.
+"""Compilation of loops by numba, and compiled loops over small dense matrices.
 
-Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to compile: loops do not.
+The machine code is stored on disk if a folder can be written. Calls of NumPy and BLAS, and assignments of slices, take
+seconds to compile in compiled code. Loops do not.
 """
 
 import gc
@@ -42,9 +43,11 @@ _stamps = dict[str, bytes]()
 
 # Any: numba has no types for compiled functions.
 def _stamp(scope: Mapping[str, Any]) -> bytes:
-    """Digest of the source of a module with these global names, of its numbers, and of the compiled modules it uses.
+    """Return the digest of a module with these global names: of its source, its numbers, and the compiled modules
+    it uses.
 
-    numba compares the file of a function only, but a caller has the code or the address of functions in other files.
+    numba compares the file of a function only. But a caller contains code, or addresses, of functions in other
+    files.
     """
     if scope["__name__"] not in _stamps:
         numbers = [
@@ -67,7 +70,9 @@ def _stamp(scope: Mapping[str, Any]) -> bytes:
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Pause the search for cycles: a compiler makes millions of objects that stay, and searching takes 10 % longer."""
+    """Pause the garbage collection of cycles. A compiler makes millions of objects that stay, and searching costs
+    10 %.
+    """
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -83,8 +88,9 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once and stores its code in a cache folder.
 
-    The log has one line when loops are compiled, and one line if they cannot be stored. A function whose signature
-    begins with a number type or void must not allocate arrays: its references are not counted. Use `scratch` there.
+    The log has one line when loops are compiled, and one line if they cannot be stored. If the signature begins
+    with a number type or void, references to arrays are not counted. The function must not allocate arrays then:
+    use `scratch`.
     """
     returns_arrays = not signature.partition("(")[0].isidentifier()
     options |= {**_OPTIONS, "no_cfunc_wrapper": True}
@@ -141,7 +147,8 @@ def merged(function: _Function) -> _Function:
 
 
 def scratch(*shape: int) -> FloatArray:
-    """Uninitialised array of one to three dimensions, on the stack of the compiled function that calls this.
+    """Return an uninitialised array of one to three dimensions, on the stack of the compiled function that calls
+    this.
 
     The call must stand outside of loops: the memory is free only after the function returns.
     """
@@ -185,8 +192,10 @@ READ, MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
 
 @inlined
 def check_rows(rows: IntArray, first: int, end: int) -> None:
-    """Raise `IndexError` for one of `rows` that is less than `first`, or not less than `end`.
-    Compiled loops check no index: one beyond an end reads or writes other memory. Each call checks those that it gets.
+    """Raise `IndexError` if one of `rows` is less than `first`, or not less than `end`.
+
+    Compiled loops do not check indices: an index beyond the end reads or writes other memory. So each call of a
+    loop checks its arguments.
     """
     for i in range(len(rows)):
         if rows[i] < first or rows[i] >= end:
@@ -195,9 +204,9 @@ def check_rows(rows: IntArray, first: int, end: int) -> None:
 
 @inlined
 def check(holds: bool) -> None:
-    """Raise `IndexError` unless the arrays of a call are as large as its loops need them."""
+    """Raise `IndexError` unless an array of a call is as large as its loops need it."""
     if not holds:
-        raise IndexError("an array is smaller than another one of the same call")
+        raise IndexError("an array is smaller than another array of the same call")
 
 
 @inlined
@@ -210,7 +219,7 @@ def copy(source: FloatArray, out: FloatArray) -> None:
 
 @shared(f"void({READ}, {READ}, {MATRIX})")
 def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    """Write A B; columns beyond those that meet are ignored."""
+    """Write A B. Columns of A and rows of B beyond the shorter of both are ignored."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             value = 0.0
@@ -221,7 +230,7 @@ def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
 
 @shared(f"void({READ}, {READ}, {MATRIX})")
 def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    """Add A B', which is symmetric, to `out`: its lower triangle, and the mirror of that."""
+    """Add A B', which must be symmetric, to `out`. The lower triangle is computed and mirrored."""
     for i in range(A.shape[0]):
         for j in range(i + 1):
             value = out[i, j]
@@ -234,14 +243,17 @@ def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> Non
 def add_congruence(
     A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray
 ) -> None:
-    """Add A P A' to `out`, and write A P."""
+    """Add A P A' to `out`, and write A P to `AP`."""
     product(A, P, AP)
     add_product_transposed(AP, A, out)
 
 
 @shared(f"void({READ}, {READ}, {MATRIX}, {MATRIX})")
 def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) -> None:
-    """Add K' R K of K (k, n) and the first k rows and columns of R, which is symmetric, to `out`; K' R is written."""
+    """Add K' R K to `out`, and write K' R to `KR`.
+
+    K has the shape (k, n). The first k rows and columns of R, which is symmetric, are used.
+    """
     k, n = K.shape
     for a in range(n):
         for c in range(k):
@@ -258,7 +270,10 @@ def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) 
 
 @shared(f"b1({READ}, int64, {MATRIX})")
 def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
-    """Write the lower Cholesky factor of the first n rows and columns to L, which may be S; False if there is none."""
+    """Write the lower Cholesky factor of the first n rows and columns of S to L, which may be S.
+
+    False if S is not positive definite.
+    """
     for i in range(n):
         for j in range(i + 1):
             value = S[i, j]
@@ -275,7 +290,7 @@ def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
 
 @shared(f"void({READ}, {MATRIX})")
 def forward(L: FloatArray, columns: FloatArray) -> None:
-    """Overwrite columns (n, m) by L^-1 columns, L (n, n) being lower triangular."""
+    """Overwrite `columns` (n, m) by L^-1 columns. L (n, n) is lower triangular."""
     for i in range(len(columns)):
         for k in range(i):
             for c in range(columns.shape[1]):
@@ -286,8 +301,9 @@ def forward(L: FloatArray, columns: FloatArray) -> None:
 
 @shared(f"b1({MATRIX}, {MATRIX})")
 def solve(S: FloatArray, columns: FloatArray) -> bool:
-    """Overwrite columns (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
-    False unless they are positive definite.
+    """Overwrite `columns` (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
+
+    False if S is not positive definite.
     """
     n = len(columns)
     if not cholesky(S, n, S):
@@ -311,7 +327,9 @@ def regularise(Q: FloatArray) -> None:
 
 @shared(f"float64({MATRIX}, float64[::1])")
 def whiten(S: FloatArray, y: FloatArray) -> float:
-    """Overwrite y (n,) by L^-1 y, and S by its Cholesky factor L; return y' S^-1 y, NaN where there is no root."""
+    """Overwrite y (n,) by L^-1 y, and S by its Cholesky factor L. Return y' S^-1 y; NaN if S is not positive
+    definite.
+    """
     total = 0.0
     if not cholesky(S, len(y), S):
         return np.nan
@@ -325,7 +343,7 @@ def whiten(S: FloatArray, y: FloatArray) -> float:
 
 @inlined
 def wrapped(angle_rad: float) -> float:
-    """Return the angle in (-pi, pi], unchanged where it lies there."""
+    """Return the angle wrapped into (-pi, pi]. An angle inside is unchanged."""
     if -math.pi < angle_rad <= math.pi:
         return angle_rad
     turned = math.pi - np.mod(math.pi - angle_rad, 2.0 * math.pi)

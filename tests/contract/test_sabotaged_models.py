@@ -248,7 +248,7 @@ def test_a_fault_in_the_source_of_the_compiled_transition_is_found(
         tmp_path / "fgtrack",
         ignore=shutil.ignore_patterns("__pycache__"),
     )
-    file = tmp_path / "fgtrack" / "models" / "transitions.py"
+    file = tmp_path / "fgtrack" / "models" / "short_bends.py"
     text, right = file.read_text(), "q, r = noise[3] * t, noise[4] * t"
     assert text.count(right) == 1
     file.write_text(text.replace(right, "q, r = 1.1 * noise[3] * t, noise[4] * t"))

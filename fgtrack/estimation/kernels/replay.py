@@ -50,7 +50,8 @@ from fgtrack.estimation.kernels.replay_steps import (
     smoothing_space,
 )
 from fgtrack.models.measurement_kernels import STACK, Stack, check_stack
-from fgtrack.models.transitions import ARC, check_noise
+from fgtrack.models.short_bends import ARC
+from fgtrack.models.transitions import check_noise
 
 OUTCOMES = "Tuple((float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1]))"
 Outcomes = tuple[FloatArray, FloatArray, FloatArray, IntArray]

@@ -32,7 +32,8 @@ from fgtrack.estimation.kernels.replay_arrays import (
     Track,
 )
 from fgtrack.models.measurement_kernels import observe, subtract
-from fgtrack.models.transitions import ARC, transition
+from fgtrack.models.short_bends import ARC
+from fgtrack.models.transitions import transition
 
 YAW = 2
 _SMOOTHING_SPACE = f"UniTuple({MATRIX}, 5)"

@@ -51,7 +51,8 @@ from fgtrack.models.measurement_kernels import (
     penalty_and_weight,
     subtract,
 )
-from fgtrack.models.transitions import ARC, check_noise, transition
+from fgtrack.models.short_bends import ARC
+from fgtrack.models.transitions import check_noise, transition
 
 OBSERVATION_SPACE = f"Tuple(({f'{VECTORS}, ' * 5}{TIMES}, {TIMES}, {TIMES}))"
 ObservationSpace = tuple[

@@ -33,7 +33,8 @@ from fgtrack.estimation.smoothing.node_arrays import (
     check_track,
 )
 from fgtrack.models.measurement_kernels import BEARING, NUM_COMPONENTS, SPEED, YAW
-from fgtrack.models.transitions import ARC, check_noise
+from fgtrack.models.short_bends import ARC
+from fgtrack.models.transitions import check_noise
 
 #: A node that is about to leave the window is relinearised after a step of this share of the thresholds.
 LEAVING_SHARE = 0.5
