@@ -5,6 +5,8 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import Any
 
+import numpy as np
+
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 from fgtrack.inputs.formats import ADAPTERS
@@ -25,6 +27,7 @@ from fgtrack.meaning.parts import (
     spreads,
     unused,
 )
+from fgtrack.meaning.times import clock_constant
 
 __all__ = ["topic_part"]
 
@@ -61,7 +64,11 @@ def topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[InputPart]) -> InputP
     """
     words = set(words_of(topic.name))
     is_truth = bool(words & TRUTH_WORDS and not words & EGO_WORDS)
-    has_clock = topic.delay is None or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
+    has_clock = (
+        topic.delay is None
+        or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
+        or clock_constant(np.array([topic.delay["p50_s"]])) is not None
+    )
     item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
     reasons = {
         "stamp_from": "its stamps come from another clock than the recorder's, or are not set"
