@@ -229,6 +229,7 @@ def study(
             on_step=lambda text, share: on_step(
                 f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share
             ),
+            decisions=draft.decisions,
         )
         with suppress(DataError):  # the runs report the same problem
             advised = adviser.advice() if advice else None

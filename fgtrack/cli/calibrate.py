@@ -67,6 +67,7 @@ def info(
     of each, and the detections of the first seconds. --write guesses such a
     configuration.
     """
+    draft: Draft | None = None
     if write is not None:
         if config_file is not None:
             raise CallError(
@@ -115,15 +116,14 @@ def info(
             with suppress(FgtrackError), progress("detections"):
                 sentences(drafted(recording).lines())
         elif config is not None and problem is None:
-            problem = _try_out(recording, config)
+            problem = _try_out(draft or drafted(recording, config))
     if problem is not None:
         raise DataError(problem)
 
 
-def _try_out(recording: Path, config: Config) -> str | None:
-    """Print the contents of the first seconds as the configuration reads them; return the recording's problem."""
+def _try_out(draft: Draft) -> str | None:
+    """Print decisions and the contents of the first seconds as they are read; return the recording's problem."""
     with progress("first seconds"):
-        draft = drafted(recording, config)
         result = draft.config
         build_road(result.map, result.defects)  # raises if files are missing
         readable = UntilBreak(draft.source.messages())

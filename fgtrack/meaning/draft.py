@@ -32,6 +32,8 @@ from fgtrack.meaning.topics import topic_part
 
 __all__ = ["Draft", "drafted", "opened", "opened_together"]
 
+ROLE = "role"
+"""Property of a decision on the role of a topic or table."""
 #: Order of decisions for a reader.
 _CERTAINTIES = ("open", "tested", "assumed")
 
@@ -90,13 +92,19 @@ class Draft:
 
     def lines(self) -> list[str]:
         """Return the result in lines: open questions, tested decisions, assumptions, unused parts."""
-        ranked = sorted(
-            self.decisions, key=lambda item: _CERTAINTIES.index(item.certainty)
-        )
+        others = [
+            item
+            for item in self.decisions
+            if item.what != ROLE or item.certainty != "assumed"
+        ]
+        ranked = sorted(others, key=lambda item: _CERTAINTIES.index(item.certainty))
+        roles = [f"{part.label} as {part.role}" for part in self.parts]
         lines = [
             item.line if item.question is None else f"{item.line}. {item.question}"
             for item in ranked
         ]
+        if roles:
+            lines.append(f"read, by names, types and values: {', '.join(roles)}")
         return [
             *lines,
             *self.assumed.lines(),
@@ -124,7 +132,7 @@ class Draft:
             (path, f"{item.certainty}: {item.reason}")
             for item in self.decisions
             for path in item.settings
-            if item.certainty == "tested" or len(path) > 4
+            if item.what != ROLE
         ]
         asked = [f"Open: {line}" for line in self.questions]
         unused = [f"Not used: {line}" for line in self.unused]
@@ -258,7 +266,7 @@ def _role(part: InputPart) -> Decision:
     reason = f"{part.label} is read as {part.role}, by its name, type and values"
     settings = {part.path: departures(part.item)}
     certainty: Certainty = "tested" if part.role_reason else "assumed"
-    return Decision(part.role, "role", settings, certainty, part.role_reason or reason)
+    return Decision(part.role, ROLE, settings, certainty, part.role_reason or reason)
 
 
 def _unreadable(path: Path, kind: str, unused: Sequence[str]) -> InputSource:
