@@ -37,6 +37,7 @@ COMMANDS = {
     "tune": "tune",
     "advise": "calibrate",
     "ledger": "ledger",
+    "rank": "rank",
     "verify": "verify",
     "info": "calibrate",
     "convert": "recordings",

@@ -1,0 +1,100 @@
+"""`fgtrack rank`: ranks methods for late measurements against the exact estimate."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+from fgtrack.cli.arguments import FormOption, Overwrite, Seed
+from fgtrack.cli.show import progress, say, sentences, show
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.output import new_files
+from fgtrack.evaluation.tables import Tables
+from fgtrack.ranking.files import write_exact, write_problem
+from fgtrack.ranking.judge import Ranking
+from fgtrack.ranking.judge import rank as ranked
+from fgtrack.ranking.methods import method
+from fgtrack.ranking.scenarios import SCENARIOS, draw
+
+
+def rank(
+    methods: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="METHOD...",
+            help="Estimator of fgtrack, Python file (.py), or executable program.",
+        ),
+    ] = None,
+    scenarios: Annotated[
+        list[str] | None,
+        Option("--scenario", help=f"Scenario; repeatable. {', '.join(SCENARIOS)}."),
+    ] = None,
+    runs: Annotated[int, Option(min=2, help="Number of runs of each scenario.")] = 10,
+    seed: Seed = 1,
+    form: FormOption = None,
+    out: Annotated[
+        Path | None,
+        Option("-o", "--out", help="Folder for ranking.md, ranking.json and pages."),
+    ] = None,
+    export: Annotated[
+        Path | None,
+        Option("--export", help="Write the first run of each scenario into a folder."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Rank methods for late measurements of one object.
+
+    Each method answers the same questions: where is the object now, and where was it?
+    The answers are compared with the truth and with the exact joint estimate.
+    """
+    names = list(dict.fromkeys(scenarios or SCENARIOS))
+    if export is not None:
+        _export(export, names, seed, overwrite)
+    if not methods:
+        if export is None:
+            raise CallError("give at least one METHOD, or --export FOLDER")
+        return
+    chosen = [method(text) for text in methods]
+    with progress("rank", len(chosen) * len(names)) as step:
+        found = ranked(chosen, names, num_runs=runs, seed=seed, on_step=step)
+    tables = Tables({table.title: table for table in found.tables()})
+    show(tables, form)
+    if form is None:
+        for each in chosen:
+            say(f"{each.name}:")
+            sentences(found.sentences(each.name))
+    if out is not None:
+        _write(out, found, tables, [each.name for each in chosen], overwrite)
+    failed = [each for each in found.results if each.problem is not None]
+    if failed:
+        raise DataError(
+            f"{failed[0].method}: {failed[0].scenario}: {failed[0].problem}"
+        )
+
+
+def _write(
+    out: Path, found: Ranking, tables: Tables, names: list[str], overwrite: bool
+) -> None:
+    """Write the tables, and a page for each method, into the folder `out`."""
+    with new_files(out, overwrite) as folder:
+        (folder / "ranking.md").write_text(tables.to_markdown(), encoding="utf-8")
+        (folder / "ranking.tex").write_text(tables.to_latex(), encoding="utf-8")
+        (folder / "ranking.json").write_text(
+            json.dumps(tables.to_dict(), indent=2), encoding="utf-8"
+        )
+        for name in names:
+            lines = [f"# {name}", "", *(f"- {line}" for line in found.sentences(name))]
+            (folder / f"{name}.md").write_text(
+                "\n".join(lines) + "\n", encoding="utf-8"
+            )
+
+
+def _export(export: Path, names: list[str], seed: int, overwrite: bool) -> None:
+    """Write measurements, truth and exact states of each scenario into a folder of its name."""
+    with new_files(export, overwrite) as folder:
+        for name in names:
+            problem = draw(name, seed)
+            (folder / name).mkdir()
+            write_problem(folder / name, problem)
+            write_exact(folder / name, problem)

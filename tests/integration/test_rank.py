@@ -1,0 +1,241 @@
+"""`fgtrack rank`: exact methods are named exact, other methods depart, and methods of others are taken in each form."""
+
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fgtrack.cli.main import app
+from fgtrack.core.errors import CallError
+from fgtrack.ranking.files import read_states, write_exact, write_problem
+from fgtrack.ranking.judge import EXACT, Ranking, Result, permuted, rank
+from fgtrack.ranking.methods import MethodError, Program, PythonFile, method
+from fgtrack.ranking.problem import LAGS_S
+from fgtrack.ranking.scenarios import SCENARIOS, draw
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "rank.md").read_text(encoding="utf-8")
+(ADAPTER,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+#: A Kalman filter that sorts all known measurements by their stamps; `SCALE` spoils its noise.
+SORTED = """
+import numpy as np
+SCALE = 1.0
+def at(given, known, time_s):
+    x, P, now = given.mean, given.covariance, 0.0
+    q = given.parameters["velocity_density_m2ps3"]
+    for each in [*sorted(known, key=lambda each: each.stamp_s), None]:
+        dt = (time_s if each is None else each.stamp_s) - now
+        if each is not None and each.stamp_s > time_s:
+            continue
+        F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
+        Q = q * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+        x, P, now = F @ x, F @ P @ F.T + Q, now + dt
+        if each is not None:
+            H, R = np.eye(2, 4), SCALE * each.stds["x_m"] ** 2 * np.eye(2)
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+            x = x + K @ (np.array([each.values["x_m"], each.values["y_m"]]) - H @ x)
+            P = P - K @ H @ P
+    return x, P
+"""
+FUSE = """
+def fuse(given, observations, queries):
+    return [at(given, observations[:known], time_s) for known, time_s in queries]
+"""
+SHORT = """
+class One:
+    def __init__(self, given): pass
+    def update(self, observation): pass
+    def state_at(self, time_s): return [1.0]
+"""
+SHELL = """#!/bin/sh
+awk -F, 'NR == 1 { for (i = 1; i <= NF; i++) at[$i] = i; print "x_m,y_m,vx_mps,vy_mps"; next }
+$at["kind"] == "query" { print x "," y ",0,0"; next }
+{ x = $at["x_m"]; y = $at["y_m"] }' "$1" > "$2"
+"""
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def program(path: Path, text: str) -> Path:
+    written(path, text).chmod(0o755)
+    return path
+
+
+def only(found: Ranking) -> Result:
+    (result,) = found.results
+    return result
+
+
+@pytest.mark.parametrize("scenario", ["linear", "one-late", "bursts", "copies"])
+def test_exact_methods_are_named_exact(scenario: str) -> None:
+    found = rank([method("smoother-banded")], [scenario], num_runs=2)
+    result = only(found)
+    assert result.deviations.max() < EXACT
+    assert result.order < EXACT
+    assert "now exact; 0.3 s ago exact; 1 s ago exact" in result.sentence
+    assert "the order of arrival does not matter" in result.sentence
+
+
+def test_a_filter_is_exact_now_and_not_in_the_past() -> None:
+    result = only(rank([method("ekf-replay")], ["linear"], num_runs=2))
+    assert result.deviations[:, 0].max() < EXACT
+    assert result.deviations[:, 1:].min() > 0.5
+
+
+def test_late_data_that_count_as_present_are_named() -> None:
+    result = only(rank([method("as-current")], ["linear"], num_runs=3))
+    assert result.deviation > 1.0
+    assert result.order > 1.0
+    assert "another order of arrival changes it" in result.sentence
+
+
+@pytest.mark.parametrize("scenario", ["range-bearing", "doppler", "ctrv"])
+def test_nonlinear_scenarios_rank_an_iterated_smoother_near_the_exact_estimate(
+    scenario: str,
+) -> None:
+    result = only(rank([method("smoother-batch")], [scenario], num_runs=2))
+    assert np.nanmax(result.deviations) < 0.2
+
+
+def test_the_adapter_of_the_page_runs_and_departs(tmp_path: Path) -> None:
+    path = written(tmp_path / "at_arrival.py", ADAPTER)
+    result = only(rank([method(str(path))], ["linear"], num_runs=2))
+    assert result.problem is None
+    assert result.deviation > 1.0
+
+
+def test_a_function_that_sorts_is_exact_now(tmp_path: Path) -> None:
+    path = written(tmp_path / "sorted.py", SORTED + FUSE)
+    result = only(rank([method(str(path))], ["linear"], num_runs=2))
+    assert result.deviations[:, 0].max() < EXACT
+
+
+def test_a_tenth_more_noise_is_named(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "noisy.py", SORTED.replace("SCALE = 1.0", "SCALE = 1.1") + FUSE
+    )
+    result = only(rank([method(str(path))], ["linear"], num_runs=2))
+    assert EXACT < result.deviation < 1.0
+    assert "now up to" in result.sentence
+
+
+def test_a_function_that_uses_later_data_is_refused(tmp_path: Path) -> None:
+    text = SORTED + FUSE.replace("observations[:known]", "observations")
+    path = written(tmp_path / "future.py", text)
+    result = only(rank([method(str(path))], ["linear"], num_runs=2))
+    assert result.problem == "its answers change where later rows are missing"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
+def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
+    path = program(tmp_path / "last.sh", SHELL)
+    result = only(rank([method(str(path))], ["linear"], num_runs=2))
+    assert result.problem is None
+    assert np.isnan(result.nees).all()
+    assert result.rmse_m[:, 0].max() < 20.0
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("#!/bin/sh\necho no model >&2\nexit 3\n", "exit code 3: no model"),
+        ("#!/bin/sh\n", "states.csv"),
+        ("#!/bin/sh\necho x_m > $2\n", "3 rows are expected, one for each query, not 0"),
+    ],
+)
+def test_a_program_that_fails_has_one_clear_line(
+    tmp_path: Path, text: str, fault: str
+) -> None:
+    result = only(
+        rank([Program(program(tmp_path / "p.sh", text))], ["linear"], num_runs=2)
+    )
+    assert result.problem is not None
+    assert fault in result.problem
+    assert "\n" not in result.problem
+
+
+def test_a_file_without_a_method_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CallError, match="define a class with update"):
+        PythonFile(written(tmp_path / "empty.py", "x = 1\n"))
+    with pytest.raises(CallError, match="neither a Python file nor an executable"):
+        method(str(written(tmp_path / "data.csv", "x\n")))
+    with pytest.raises(CallError, match="ekf-replay"):
+        method("ekf-repaly")
+
+
+def test_a_wrong_answer_is_named(tmp_path: Path) -> None:
+    one = PythonFile(written(tmp_path / "short.py", SHORT))
+    with pytest.raises(MethodError, match=r"shape \(4,\)"):
+        one.answers(draw("linear", 1))
+
+
+def test_truth_and_exact_estimate_agree_with_the_exact_covariance() -> None:
+    nees = []
+    for seed in range(8):
+        problem = draw("linear", seed)
+        for query, answer in zip(problem.queries, problem.exact, strict=True):
+            if query.lag_s == 0.0:
+                error = answer.mean - problem.truth[query.stamp_ns]
+                nees.append(error @ np.linalg.solve(answer.covariance, error))
+    assert 2.5 < np.mean(nees) < 6.0
+
+
+def test_a_problem_is_the_same_for_a_seed_and_keeps_all_arrivals_in_another_order() -> (
+    None
+):
+    one, two = draw("copies", 3), draw("copies", 3)
+    assert [each.key for each in one.arrivals] == [each.key for each in two.arrivals]
+    other = permuted(one, np.random.default_rng(1))
+    assert sorted(each.key for each in other.arrivals) == sorted(
+        each.key for each in one.arrivals
+    )
+    assert len({each.key for each in one.arrivals}) < len(one.arrivals)
+    assert {query.lag_s for query in other.queries} == set(LAGS_S)
+
+
+def test_exported_files_hold_the_exact_states(tmp_path: Path) -> None:
+    problem = draw("ctrv", 2)
+    path = write_problem(tmp_path, problem)
+    write_exact(tmp_path, problem)
+    found = read_states(tmp_path / "exact.csv", len(problem.queries))
+    for answer, exact in zip(found, problem.exact, strict=True):
+        assert answer is not None
+        assert answer.covariance is not None
+        assert exact.covariance is not None
+        np.testing.assert_array_equal(answer.mean, exact.mean)
+        np.testing.assert_allclose(answer.covariance, exact.covariance, atol=1e-15)
+    lines = path.read_text().splitlines()
+    assert sum(line.startswith("query") for line in lines) == len(problem.queries)
+    assert json.loads((tmp_path / "problem.json").read_text())["motion"] == "ctrv"
+
+
+def test_the_command_prints_tables_and_writes_a_page_for_each_method(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "out"
+    words = ["rank", "ekf-replay", "drop", "--scenario", "one-late", "--runs", "2"]
+    done = CliRunner().invoke(app, [*words, "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "now exact" in done.output
+    assert sorted(os.listdir(out)) == [
+        "drop.md",
+        "ekf-replay.md",
+        "ranking.json",
+        "ranking.md",
+        "ranking.tex",
+    ]
+    assert "not fused" in (out / "drop.md").read_text()
+
+
+def test_the_page_lists_every_scenario() -> None:
+    for name, scenario in SCENARIOS.items():
+        assert f"| `{name}` | {scenario.about} |" in PAGE
