@@ -24,7 +24,7 @@ _US = 1e6
 
 @dataclass(frozen=True)
 class Result:
-    """What a method did in one scenario."""
+    """Answers of a method in one scenario, compared with truth and exact estimate."""
 
     method: str
     scenario: str
