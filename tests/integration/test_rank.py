@@ -149,7 +149,10 @@ def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
     [
         ("#!/bin/sh\necho no model >&2\nexit 3\n", "exit code 3: no model"),
         ("#!/bin/sh\n", "states.csv"),
-        ("#!/bin/sh\necho x_m > $2\n", "3 rows are expected, one for each query, not 0"),
+        (
+            "#!/bin/sh\necho x_m > $2\n",
+            "3 rows are expected, one for each query, not 0",
+        ),
     ],
 )
 def test_a_program_that_fails_has_one_clear_line(
