@@ -199,7 +199,7 @@ def _explained(
     tables = {
         "waterfall": _waterfall(replays, waterfall),
         "policies": _policies(replays, policies),
-        "waiting": _waiting(policies),
+        "waiting": _waiting(replays, policies),
         "sensors": _sensors(replays, best, policies[REPLAY][0], common),
     }
     sentence = _sentence(waterfall, tables)
@@ -280,7 +280,7 @@ def _waterfall(replays: PairedReplay, parts: Sequence[Contribution]) -> Table:
     ]
     columns = [
         Column("without, one after the other", "cause", left=True),
-        Column("position\nRMSE [m]", "rms_m"),
+        Column(f"{_word(replays)}position\nRMSE [m]", "rms_m"),
         Column("mean square\n[m^2]", "left_m2", text=_four),
         _interval("its part\n[m^2] (95 %)", "share", _four),
     ]
@@ -314,7 +314,7 @@ def _policies(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
     ]
     columns = [
         Column("estimator", left=True),
-        Column("position RMSE\nnow [m]", "rms_m"),
+        Column(f"{_word(replays)}position RMSE\nnow [m]", "rms_m"),
         _interval("more than ekf-replay\n[m] (95 %)", "more"),
         Column(f"of {WAITS_S[_WAITED]:g} s ago\n[m]", "waited_m"),
     ]
@@ -322,7 +322,7 @@ def _policies(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
     return Table(title, records, columns, ("estimator",), [_note(replays)])
 
 
-def _waiting(policies: Mapping[str, Squares]) -> Table:
+def _waiting(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
     filters = policies[REPLAY]
     smoothers = policies[SMOOTHER]
     common: BoolArray = np.all(np.isfinite([*filters, *smoothers]), axis=0)
@@ -338,11 +338,11 @@ def _waiting(policies: Mapping[str, Squares]) -> Table:
     ]
     columns = [
         Column("state of [s] ago", "wait_s"),
-        Column("filtered\nRMSE [m]", "filter_m"),
-        Column("smoothed\nRMSE [m]", "smoother_m"),
+        Column(f"{_word(replays)}filtered\nRMSE [m]", "filter_m"),
+        Column(f"{_word(replays)}smoothed\nRMSE [m]", "smoother_m"),
         _interval("smoothing gives\n[m] (95 %)", "gain"),
     ]
-    return Table("What waiting buys", records, columns, ("wait_s",))
+    return Table("What waiting buys", records, columns, ("wait_s",), [_note(replays)])
 
 
 def _at_stamp_of(mine: Container[int], item: BankCall) -> int:
@@ -351,6 +351,11 @@ def _at_stamp_of(mine: Container[int], item: BankCall) -> int:
 
 def _without(left_out: Container[int], item: BankCall) -> int | None:
     return None if id(item) in left_out else item.now_ns
+
+
+def _word(replays: PairedReplay) -> str:
+    """First word of a heading of errors: without truth they are predicted."""
+    return "" if replays.objects is not None else "predicted\n"
 
 
 def _note(replays: PairedReplay) -> str:

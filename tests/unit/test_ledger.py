@@ -192,6 +192,14 @@ def test_without_truth_predicted_variances_stand_for_errors(
     result = ledger([m for m in messages if not isinstance(m, TruthState)], config)
     assert not result.with_truth
     assert "No truth" in str(result)
+    headings = [
+        " ".join(column.heading.split())
+        for table in result.tables.tables.values()
+        for column in table.columns
+        if "RMSE" in column.heading
+    ]
+    assert headings
+    assert all(heading.startswith("predicted ") for heading in headings)
     assert math.isfinite(result.waterfall[0].mean_square_m2)
     assert result.waterfall[-1].share_m2.mean > 0.0
 
