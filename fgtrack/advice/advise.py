@@ -273,9 +273,13 @@ class Adviser:
         for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
             one = self._arrivals[name]
             constant = None
-            if name != EGO and len(one.stamps_ns) >= FEWEST and one.stamps_ns.any():
+            offset_s = 0.0
+            if name != EGO and one.stamps_ns.any():
                 offset_s = self._config.sensors[name].clock_offset_s
-                constant = clock_constant(one.delays_s + offset_s)
+                stamps_ns = one.stamps_ns - nanoseconds(offset_s)
+                one = replace(one, stamps_ns=stamps_ns)
+                if len(stamps_ns) >= FEWEST:
+                    constant = clock_constant(one.delays_s)
             if constant is None:
                 yield from stamp_findings(one)
                 continue

@@ -486,6 +486,16 @@ def test_a_constant_of_clocks_is_recognised_and_replayed(
     assert not any("stamps" in line for line in advice.fine if "radar" in line)
 
 
+def test_a_clock_that_is_corrected_already_is_no_finding(call: Call) -> None:
+    write(changed(delayed("radar", 18_000), drive(truth=False)))
+    Path("c.yaml").write_text(
+        CONFIG.replace("radar: {", "radar: {clock_offset_s: 18.0, ")
+    )
+    advice = fgtrack.advise("drive.jsonl", "c.yaml")
+    assert not [one for one in advice.findings if one.kind == "clock"]
+    assert any("Fine, radar: stamps: 0 of 150" in line for line in advice.fine)
+
+
 def test_advice_that_does_not_help_is_withdrawn_with_the_numbers(call: Call) -> None:
     """The stamps lie 23 s before their receipts, which no constant explains, and the window cannot help."""
     write(changed(delayed("radar", -23_000), drive(truth=False)))
