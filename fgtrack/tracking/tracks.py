@@ -1,4 +1,4 @@
-"""What a tracker knows of its tracks beside states, lives and objects: numbers, and first positions."""
+"""Numbers and first positions of the tracks, beside their states, lives and objects."""
 
 from collections import Counter
 from collections.abc import Sequence
