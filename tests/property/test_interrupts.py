@@ -18,7 +18,15 @@ from fgtrack.pipeline.live import Tracker
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
 #: Modules that hand detections on. All others are called by them, and hold none.
-HOLDERS = ("pipeline/live.py", "tracking/tracker.py", "tracking/inbox.py")
+HOLDERS = (
+    "pipeline/live.py",
+    "tracking/inbox.py",
+    "tracking/list_update.py",
+    "tracking/publication.py",
+    "tracking/track_starts.py",
+    "tracking/tracker.py",
+    "tracking/tracks.py",
+)
 PUBLISHED_HOLDER = ("karle2023/tracker_parts.py",)
 
 
