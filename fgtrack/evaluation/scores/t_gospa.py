@@ -33,7 +33,8 @@ def t_gospa(
     gamma of a switch. The metric minimises over the shares W_k(i, j) in [0, 1] of
     object i that track j has at tick k:
 
-        sum over k of GOSPA^2(W_k) + gamma^2 / 2 sum over i, j of |W_k(i, j) - W_(k-1)(i, j)|
+        sum of GOSPA^2(W_k) over k
+        + gamma^2 / 2 times the sum of abs(W_k(i, j) - W_(k-1)(i, j)) over i, j, k
 
     A change from one track to another costs gamma^2. The start or the end of a pair
     costs gamma^2 / 2.
