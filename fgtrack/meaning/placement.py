@@ -1,6 +1,6 @@
 """Decisions on frames and mounts: from header frames and tf, from the motion of objects, from other sensors."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
 from itertools import islice
 
@@ -226,7 +226,10 @@ def _table_frame(
 def mount_decisions(sample: Sample) -> Iterator[Decision]:
     """Yield the mount of each sensor on the ego: as estimated, or assumed where it is not observable.
 
-    A sensor whose header frame is unknown, and whose yaw no test shows, stays open.
+    A sensor whose header frame is unknown, and whose yaw no test shows, stays open. So
+    do sensors with ranges and bearings beside other sensors, if nothing shows their
+    mount. So do sensors with positions in frames that differ, if nothing shows which
+    frame is the ego's. A lone sensor, or sensors that agree, may be assumed in the ego.
     """
     paths = {
         name: path
@@ -236,21 +239,97 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     }
     if not paths:
         return
-    mounts = mounts_of(sample.messages, sample.config)
+    headers = _HeaderFrames(sample)
+    shown = {name for name in _sensors(sample) if _shows_ego(sample, name, headers)}
+    mounts = mounts_of(sample.messages, sample.config, shown)
+    doubts = _doubts(sample, mounts, shown)
     for name, path in paths.items():
         if name in mounts.in_map:
             continue
-        if name in mounts:
+        if name in doubts:
+            question = _question(sample, name)
+            yield Decision(name, "mount", {}, "open", doubts[name], question)
+        elif name in mounts:
             yield from _mount_decision(sample, mounts, name, path)
         elif _has_unknown_header(sample, name):
-            yield _unanswered(name, "it has no positions that the tests can use")
+            yield _unanswered(
+                sample, name, "it has no positions that the tests can use"
+            )
 
 
-def mounts_of(messages: Sequence[Message], config: Config) -> Mounts:
+def _shows_ego(sample: Sample, name: str, headers: _HeaderFrames) -> bool:
+    """True if a header, or a setting of the user, puts the positions of a sensor into the ego's frame."""
+    path = sample.input_path(name)
+    item = _mapping(sample, name)
+    if path is None or item is None or item.frame not in (None, "ego"):
+        return False
+    if not sample.is_open((*path, "frame")):
+        return True
+    return isinstance(item, TopicInput) and headers.of(name) is not None
+
+
+def _doubts(sample: Sample, mounts: Mounts, shown: Set[str]) -> dict[str, str]:
+    """Return the sensors whose mount stays open, each with the reason: nothing shows the mount of their reference."""
+    groups: dict[str, list[str]] = {}
+    for item in mounts.sensors:
+        reference = mounts.references.get(item.sensor, item.sensor)
+        groups.setdefault(reference, []).append(item.sensor)
+    result: dict[str, str] = {}
+    for reference, members in groups.items():
+        is_mounted = _is_mounted(sample, reference)
+        is_known = is_mounted or reference in mounts.in_map or reference in shown
+        if is_known or mounts[reference].is_sure_of_yaw:
+            continue
+        why = _doubt(sample, mounts, members, shown)
+        if why is not None:
+            result |= {
+                name: why
+                for name in members
+                if name not in shown and not _is_mounted(sample, name)
+            }
+    return result
+
+
+def _doubt(
+    sample: Sample, mounts: Mounts, members: Sequence[str], shown: Set[str]
+) -> str | None:
+    """Return the reason against the assumption that the reference of `members` is in the ego's frame; None without."""
+    reference = mounts.references.get(members[0], members[0])
+    others = [name for name in members if name != reference]
+    off = [name for name in others if mounts[name].is_off]
+    against = "; ".join(f"against {reference}, {mounts[name]}" for name in off)
+    if _mapping_frame(sample, reference) == "ego":
+        in_ego = [name for name in others if _mapping_frame(sample, name) == "ego"]
+        rivals = [name for name in in_ego if name in off]
+        agreeing = [
+            name for name in in_ego if name not in off and mounts[name].is_sure_of_yaw
+        ]
+        if len(rivals) > len(agreeing):
+            return f"nothing shows which sensor is in the ego's frame: {against}"
+    elif off:
+        return f"nothing shows the mount of {reference}: {against}"
+    elif len(members) < len(mounts.sensors):
+        return (
+            f"nothing shows it: {mounts[reference].why}, and too few of its detections "
+            "are common with other sensors"
+        )
+    return None
+
+
+def _is_mounted(sample: Sample, name: str) -> bool:
+    """True if the settings contain the mount of a sensor."""
+    sensor = sample.config.sensors.get(name)
+    return sensor is not None and sensor.mount is not None
+
+
+def mounts_of(
+    messages: Sequence[Message], config: Config, shown: Set[str] = frozenset()
+) -> Mounts:
     """Estimate the mounts of all sensors from the first minutes of `messages`, compared with those in `config`.
 
     References are sensors in the map, then sensors with a configured mount, then
-    sensors with positions in the ego frame.
+    sensors with positions in the ego frame, first those that a header or the user
+    has put there (`shown`).
     """
     used = [
         item
@@ -272,17 +351,23 @@ def mounts_of(messages: Sequence[Message], config: Config) -> Mounts:
         name for name in points if frames[name] == "ego" and not points[name].is_polar
     ]
     known = [name for name in points if frames[name] == "map" or name in assumed]
-    known += sorted(in_ego, key=lambda name: (-size[name], name))
+    known += sorted(in_ego, key=lambda name: (name not in shown, -size[name], name))
     return estimated_mounts(points, motion, assumed, known)
 
 
-def _unanswered(name: str, why: str) -> Decision:
+def _unanswered(sample: Sample, name: str, why: str) -> Decision:
     """Open decision on the mount of a sensor in an unknown frame."""
-    return Decision(name, "mount", {}, "open", why, _question(name))
+    return Decision(name, "mount", {}, "open", why, _question(sample, name))
 
 
-def _question(name: str) -> str:
-    return f"where is it mounted? Set sensors.{name}.mount (x_m, y_m, yaw_rad)"
+def _question(sample: Sample, name: str) -> str:
+    """Return the question for the mount of a sensor, with the keys that answer it."""
+    mount = f"sensors.{name}.mount (x_m, y_m, yaw_rad)"
+    path = sample.input_path(name)
+    if path is None or _mapping_frame(sample, name) != "ego":
+        return f"where is it mounted? Set {mount}"
+    frame = ".".join((*path, "frame"))
+    return f"is it in the ego's frame? Set {frame}: ego, or {frame}: sensor and {mount}"
 
 
 def _mount_decision(
@@ -302,7 +387,9 @@ def _mount_decision(
             reason = (
                 f"its header puts it into the ego's frame, but {against}{item.words}"
             )
-            yield Decision(name, "mount", {}, "assumed", reason, _question(name))
+            yield Decision(
+                name, "mount", {}, "assumed", reason, _question(sample, name)
+            )
         return
     if item.is_off and is_placed:
         frame = "optical" if _mapping_frame(sample, name) == "optical" else "sensor"
@@ -313,7 +400,7 @@ def _mount_decision(
         question = (
             None
             if item.is_known
-            else f"components without an interval are assumed; {_question(name)}"
+            else f"components without an interval are assumed; {_question(sample, name)}"
         )
         yield Decision(
             name, "mount", settings, "tested", f"{against}{item.words}", question
@@ -323,14 +410,14 @@ def _mount_decision(
         question = (
             None
             if item.is_known
-            else f"its lever arm is assumed to be 0; {_question(name)}"
+            else f"its lever arm is assumed to be 0; {_question(sample, name)}"
         )
         yield Decision(name, "mount", {}, "tested", reason, question)
     elif _has_unknown_header(sample, name):
-        yield _unanswered(name, f"its frame is unknown: {item.why}")
+        yield _unanswered(sample, name, f"its frame is unknown: {item.why}")
     else:
         reason = f"at the origin of the ego, its axis ahead: {item.why}"
-        yield Decision(name, "mount", {}, "assumed", reason, _question(name))
+        yield Decision(name, "mount", {}, "assumed", reason, _question(sample, name))
 
 
 def _is_read_in_ego(sample: Sample, name: str) -> bool:

@@ -1,0 +1,102 @@
+"""Decisions on the mounts of simulated drives: a mount that nothing shows is asked for, and never guessed."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from fgtrack.config.settings import Config
+from fgtrack.core.types import DetectionList
+from fgtrack.meaning.decision import Decision
+from fgtrack.meaning.placement import mount_decisions
+from fgtrack.meaning.sample import Sample
+from tests.support.scripts import load
+
+DRIVES = load("mounts", "drives")
+Sensor = DRIVES.Sensor
+MOVING = {"parked": 0, "turning": 0.0}
+"""A drive that does not show the mount of the reference."""
+
+
+def decisions(
+    seed: int,
+    *sensors: Sensor,
+    given: Mapping[str, object] | None = None,
+    **drive: float,
+) -> dict[str, Decision]:
+    """Return the decisions for tables of the sensors, and for the user's settings in `given`."""
+    user = Config().replace(given or {})
+    config = user
+    for item in sensors:
+        frame = {"polar": "sensor", "sensor": "ego"}.get(item.form, item.form)
+        key = f"input.csv.detections.{item.name}"
+        table = {f"{key}.file": f"{item.name}.csv", f"{key}.columns": {"x_m": "x"}}
+        config = config.replace({f"{key}.frame": frame, **table, **(given or {})})
+    frames = {name: item.frame for name, item in config.input.csv.detections.items()}
+    messages = [
+        replace(item, frame=frames[item.sensor])
+        if isinstance(item, DetectionList)
+        else item
+        for item in DRIVES.drive(seed, sensors, **drive).messages
+    ]
+    sample = Sample(Path("drive"), user, config, messages)
+    return {each.about: each for each in mount_decisions(sample)}
+
+
+FRONT = Sensor("front", form="ego", half_view_rad=0.9)
+REAR = Sensor("rear", math.pi, -1.0, half_view_rad=0.9)
+
+
+def test_a_radar_without_common_objects_is_asked_for_beside_another_sensor() -> None:
+    found = decisions(1, FRONT, REAR, **MOVING)
+    assert found["rear"].certainty == "open"
+    assert "sensors.rear.mount" in str(found["rear"].question)
+    assert found["front"].certainty == "assumed"
+    assert "input.csv.detections.front.frame" in str(found["front"].question)
+
+
+def test_a_lone_radar_may_be_assumed_in_the_ego_frame() -> None:
+    found = decisions(1, Sensor("rear", half_view_rad=0.9), **MOVING)
+    assert found["rear"].certainty == "assumed"
+    assert "sensors.rear.mount" in str(found["rear"].question)
+
+
+def test_a_given_mount_is_not_asked_for() -> None:
+    mount = {"sensors.rear.mount": {"x_m": -1.0, "yaw_rad": 3.14}}
+    assert "rear" not in decisions(1, FRONT, REAR, given=mount, **MOVING)
+
+
+LEFT = Sensor("left", 0.3, 2.0, 1.0, "sensor", 1.5, clutter=0.2)
+RIGHT = Sensor("right", -0.4, 2.0, -1.0, "sensor", 1.5, clutter=0.2)
+
+
+def test_positions_in_frames_that_differ_are_asked_for() -> None:
+    found = decisions(2, LEFT, RIGHT, **MOVING)
+    for name in ("left", "right"):
+        assert found[name].certainty == "open"
+        assert f"input.csv.detections.{name}.frame: ego" in str(found[name].question)
+        assert "degrees" in found[name].reason
+
+
+def test_the_answer_for_one_frame_shows_the_other_mount() -> None:
+    answer = {"input.csv.detections.right.frame": "ego"}
+    right = Sensor("right", form="ego", half_view_rad=1.5, clutter=0.2)
+    found = decisions(2, LEFT, right, given=answer, **MOVING)
+    assert found["left"].certainty == "tested"
+    mount = found["left"].settings["sensors", "left", "mount"]
+    assert isinstance(mount, dict)
+    assert abs(mount["yaw_rad"] - 0.3) < 0.02
+
+
+def test_sensors_that_agree_may_be_assumed_in_the_ego_frame() -> None:
+    one = Sensor("one", form="ego", half_view_rad=1.5, clutter=0.2)
+    other = Sensor("other", form="ego", half_view_rad=1.5, clutter=0.2)
+    found = decisions(2, one, other, **MOVING)
+    assert {item.certainty for item in found.values()} <= {"assumed", "tested"}
+
+
+def test_radars_in_different_axes_are_asked_for_together() -> None:
+    front = Sensor("front", 0.1, 3.0, half_view_rad=1.3, clutter=0.2)
+    left = Sensor("left", 0.8, 2.0, 1.0, half_view_rad=1.3, clutter=0.2)
+    found = decisions(2, front, left, **MOVING)
+    assert {item.certainty for item in found.values()} == {"open"}
