@@ -91,7 +91,7 @@ def noise_fits(run: Run) -> list[NoiseFit]:
 
 
 def noise_findings(outcome: "RunQuality") -> Iterator[Finding]:
-    """Yield the sensors with inconsistent noise, and those with a few very large innovations."""
+    """Yield findings on sensors with inconsistent noise, and on sensors with a few very large innovations."""
     off = dict(inconsistent_sensors(outcome.run))
     for one in outcome.noise:
         if one.sensor in off:
@@ -146,7 +146,7 @@ class RunQuality:
 
     @classmethod
     def of(cls, run: Run) -> "RunQuality":
-        """Compute the numbers of `run`."""
+        """Compute the quality of `run`."""
         counts = dict(run.meta["counts"])
         used = {
             name: sum(item.get(fate, 0) for fate in USED) / (sum(item.values()) or 1)
@@ -170,7 +170,10 @@ class RunQuality:
 
     @property
     def breaks_per_minute(self) -> float:
-        """Track breaks per true object and minute; NaN without truth."""
+        """Track breaks per minute in which a true object is present; NaN without truth.
+
+        A break is a resumption of tracking after a loss, or with another track.
+        """
         minutes = (
             0.0 if self.truth is None else self.truth.ticks_present * self.tick_s / 60.0
         )

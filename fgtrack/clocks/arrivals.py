@@ -135,8 +135,8 @@ class Arrivals:
     def lost_share(self) -> float | None:
         """Share of lists that never arrived, estimated from gaps between stamps.
 
-        None if the stamps have no period. None also for objects that report themselves,
-        in lists of one object with an identity.
+        None if there are few lists, or if the stamps have no period. None also if each
+        object sends its own list: each list has one detection, and its object has an identity.
         """
         if len(self.steps_s) < FEWEST or (
             self.object_late is not None and self.counts.max() == 1

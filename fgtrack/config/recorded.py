@@ -35,7 +35,7 @@ class RecordedSensor:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Configuration keys that a recording may carry; None if not recorded."""
+    """Configuration keys that a recording may carry; a key that it does not carry has its default."""
 
     ego: EgoConfig = field(default_factory=EgoConfig)
     map: MapConfig = field(default_factory=MapConfig)

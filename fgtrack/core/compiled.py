@@ -112,9 +112,10 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def shared(signature: str) -> Callable[[_Function], _Function]:
-    """Return a decorator for functions that only compiled functions call: compiled and stored once, as by `njit`.
+    """Return a decorator that compiles a function once, for callers that are compiled functions.
 
-    Callers have the address of the function. A function without this decorator becomes a part of each caller.
+    The code is stored as by `njit`. Callers call the function by its address. A function without this decorator is
+    compiled into each caller.
     """
 
     def compiled(function: _Function) -> _Function:
@@ -204,7 +205,7 @@ def check_rows(rows: IntArray, first: int, end: int) -> None:
 
 @inlined
 def check(holds: bool) -> None:
-    """Raise `IndexError` unless an array of a call is as large as its loops need it."""
+    """Raise `IndexError` if `holds` is False: an array of a call is smaller than its loops need."""
     if not holds:
         raise IndexError("an array is smaller than another array of the same call")
 

@@ -13,7 +13,7 @@ __all__ = ["EstimatorError", "Failure", "Failures"]
 
 
 class Failure(StrEnum):
-    """Kind of a failure inside an estimator, or of the tracker's response."""
+    """Kind of a failure in an estimator or in the tracker, or of the response to a failure."""
 
     NOT_FINITE = "not finite"
     """A state that was to be published was not finite, or was beyond any vehicle on Earth, see `faults`."""

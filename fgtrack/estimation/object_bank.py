@@ -70,7 +70,9 @@ class Outcomes:
 
 
 def as_unchanged(error: Exception, track_ids: Sequence[int]) -> Exception:
-    """Return the `EstimatorError` of an error that left the states of these tracks as before; a `DataError` itself."""
+    """Return an `EstimatorError` for an error that has not changed the states of these tracks. A `DataError` is
+    returned as it is.
+    """
     if isinstance(error, DataError):
         return error
     return EstimatorError(dict.fromkeys(track_ids, error), {}, track_ids)
@@ -207,7 +209,7 @@ class ObjectBank(Stateful, Generic[_E]):
     def _ask(
         self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None
     ) -> dict[int, _T]:
-        """Return the results of `question` for all estimators, or for `track_ids`, by track id.
+        """Return the results of `question` by track id, for all estimators or for `track_ids`.
 
         Raises `EstimatorError` if the question raises for some of them.
         """
@@ -257,7 +259,7 @@ def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArr
 
 @contextmanager
 def _own_cause() -> Iterator[None]:
-    """Raise the exception of the only track instead of its `EstimatorError`."""
+    """Replace an `EstimatorError` by the exception that the only track of the bank has raised."""
     try:
         yield
     except EstimatorError as error:
@@ -407,13 +409,15 @@ def ahead_of(
 def state_of(
     bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int
 ) -> TrackState:
-    """Return the state of a track of `bank` at any stamp. Raises `CallError` for a stamp before the window of the
-    track.
+    """Return the state of a track of `bank` at any stamp.
+
+    Raises `CallError` for a stamp before the window of the track, and for a state that is not finite.
     """
     states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
         raise CallError(
-            f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite"
+            f"track {track_id} has no state at {stamp_ns} ns: "
+            "the stamp lies before its window, or the state is not finite"
         )
     row = states.track_ids.index(track_id)
     return track_state(motion, stamp_ns, states.means[row], states.covariances[row])

@@ -122,7 +122,7 @@ class Claims:
 
     @classmethod
     def of(cls, factory: Factory) -> "Claims":
-        """Return the claims of `factory`."""
+        """Return the promises that `factory` declares in its attributes. A missing attribute has the default."""
         return cls(
             **{
                 f.name: getattr(factory, f.name)
@@ -142,7 +142,7 @@ def list_estimators(group: str | None = None) -> list[str]:
 
 
 def estimator_claims(name: str) -> Claims:
-    """Return what the estimator `name` promises. Raises `CallError` for an unknown name."""
+    """Return the promises of the estimator `name`. Raises `CallError` for an unknown name."""
     return Claims.of(ESTIMATORS.load(name))
 
 
@@ -174,7 +174,7 @@ def estimator(
     ):
         if not isinstance(value, kind):
             raise CallError(
-                f"{what}: must be a {kind.__name__}, is a {type(value).__name__}"
+                f"argument {what}: must be a {kind.__name__}, is a {type(value).__name__}"
             )
     if not is_number(lag_s, 0.0):
         raise CallError(
@@ -192,7 +192,10 @@ def start_estimator(
     lag_s: float,
     options: Mapping[str, Any],
 ) -> Estimator:
-    """Return the estimator of one object from a `factory`, which need not be registered. Errors contain its `name`."""
+    """Return the estimator of one object from a `factory`, which need not be registered.
+
+    `name` is the name of the estimator in messages.
+    """
     claims, own = Claims.of(factory), dict(options)
     method = "one-point" if claims.initiates else own.pop("initiation", DEFAULT)
 
@@ -219,7 +222,7 @@ def estimator_bank(
     options: Mapping[str, Any],
     factory: Factory | None = None,
 ) -> TrackBank:
-    """Return the bank of the estimators `name` of all objects. Raises as `estimator`.
+    """Return the bank with the estimators `name` of all objects. Raises the exceptions of `estimator`.
 
     With a `factory` the name need not be registered.
     """

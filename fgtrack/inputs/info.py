@@ -31,7 +31,7 @@ class TopicInfo:
     type: str
     count: int
     rate_hz: float | None
-    """Rate of distinct receipts; None for fewer than two."""
+    """Rate of distinct receipts; None for fewer than two receipts."""
     delay: Mapping[str, float] | None
     """Delay from stamp to receipt: `mean_s`, `p50_s`, `p90_s` and `max_s`; None if the type has no header."""
     used_as: str | None
@@ -39,7 +39,7 @@ class TopicInfo:
     note: str | None
     """Reason why the topic cannot be decoded, or a problem of its messages; None if there is no problem."""
     late: Mapping[str, float | None]
-    """Shares that are out of sequence; None for fewer than two.
+    """Shares of messages and detections that are out of sequence; None if there are fewer than two.
 
     `stream_share`: share of the messages with an older stamp than an earlier received
     message of the topic. `object_share`: share of the detections with an identity that
@@ -69,7 +69,7 @@ _Times = tuple[int, int | None]
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     """Return the contents of the input at `path`, and their use in a replay with `config`.
 
-    Raises as `open_input`.
+    Raises the exceptions of `open_input`.
     """
     path = Path(path)
     given = config or InputConfig()
@@ -221,7 +221,10 @@ def _right(
     stamps: Iterable[tuple[BagTopic, int, int | None]],
     left_out: Mapping[str, Counter[str]],
 ) -> Iterator[tuple[BagTopic, int, int | None]]:
-    """Yield the `stamps` of a recording's messages without wrong log times, which are counted in `left_out`."""
+    """Yield the `stamps` of messages with a plausible log time.
+
+    Messages with a wrong log time are left out, and counted by topic in `left_out`.
+    """
     for each, is_wrong in sorted_out(stamps, itemgetter(1)):
         if is_wrong:
             left_out[each[0].name][WRONG_RECEIPT] += 1
@@ -265,8 +268,8 @@ class IdentityOrder:
         self._newest_ns: dict[tuple[str, str], int] = {}
 
     def late(self, message: DetectionList) -> list[bool]:
-        """Return, for each detection with a repeated identity, True if it is older than the newest one
-        of the identity.
+        """Return, for each detection with a repeated identity, True if it is older than the newest detection of the
+        identity.
         """
         late = list[bool]()
         for item in message.objects:

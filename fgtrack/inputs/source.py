@@ -45,7 +45,7 @@ class FileFormat:
     recognises: Callable[[Path], bool]
     """True if the content of a non-empty file or of a folder has this format; may raise `OSError`."""
     open: Callable[[Path, InputConfig], Callable[[], Iterator[Message]]]
-    """Opens the input at a path: returns `InputSource.messages`, raises as `open_input`."""
+    """Opens the input at a path: returns `InputSource.messages`, raises the exceptions of `open_input`."""
     settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
     """Returns the settings that the input at a path carries, as `InputSource.settings`."""
     validates: bool = False
@@ -76,7 +76,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
 def input_kind(path: Path) -> str:
     """Return the name of the format of `path`, recognised by the content; plug-ins are asked first.
 
-    Raises as `open_input`.
+    Raises the exceptions of `open_input`.
     """
     try:
         exists = path.exists()
@@ -90,7 +90,7 @@ def input_kind(path: Path) -> str:
     try:
         if not path.is_file() and not path.is_dir():
             raise DataError(
-                f"{path}: is neither a file nor a folder, write its content to a file first"
+                f"{path}: exists, but is neither a file nor a folder; write its content to a file first"
             )
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")

@@ -40,8 +40,10 @@ Record = dict[str, Any]
 def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[Message]:
     """Yield the messages of the stream `path`, plain or gzipped, in the order of the file, which is receipt order.
 
-    Unknown keys are ignored with one warning. Raises `TruncatedInput` after the
-    messages before a break, and `DataError` for other faults.
+    Latitudes and longitudes are converted into positions in `plane`. By default the first
+    position is the origin of the plane. Unknown keys are ignored with one warning.
+
+    Raises `TruncatedInput` after the messages before a break, and `DataError` for other faults.
     """
     path = Path(path)
     plane = plane or LocalPlane()
@@ -157,7 +159,7 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
-    """Yield line number and JSON object of every line that is not blank; the first is the header."""
+    """Yield line number and JSON object of each line that is not blank; the first object is the header."""
     line = 0
     num_records = 0
     try:
@@ -175,7 +177,8 @@ def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
                 except (ValueError, RecursionError) as error:
                     if num_records and not text.endswith(b"\n"):
                         raise TruncatedInput(
-                            f"{path}:{line}: breaks off in the middle of record {num_records + 1}"
+                            f"{path}:{line}: breaks off in the middle of record {num_records + 1}, "
+                            "only the records before it can be read"
                         ) from error
                     raise DataError(f"{path}:{line}: is not JSON ({error})") from error
                 if not isinstance(record, dict):
@@ -189,7 +192,7 @@ def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
                 yield line, record
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise TruncatedInput(
-            f"{path}:{line + 1}: breaks off after record {num_records} ({error})"
+            f"{path}:{line + 1}: breaks off after record {num_records} ({error}), only the records up to it can be read"
         ) from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
@@ -266,9 +269,10 @@ def _from_json(
 
 
 def _value(key: str, value: Any) -> Any:
-    """Return `value` in the type of the field `key`: a list becomes a tuple, an integer of a real field a float.
+    """Return `value` in the type of the field `key`: a list becomes a tuple, an integer in a real field becomes a
+    float.
 
-    A huge integer stays, because no float can represent it.
+    An integer that no float can represent is returned unchanged.
     """
     if type(value) is list:
         return tuple(

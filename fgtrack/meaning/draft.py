@@ -112,7 +112,7 @@ class Draft:
         ]
 
     def with_assumed(self, assumed: Assumed) -> "Draft":
-        """Return the draft with other settings and assumptions; sensors with an open question are not ignored in it."""
+        """Return the draft with other settings and assumptions. It does not ignore sensors with an open question."""
         ignored = [
             name
             for name in assumed.config.ignore_sensors
@@ -122,10 +122,10 @@ class Draft:
         return replace(self, assumed=replace(assumed, config=config))
 
     def to_yaml(self, head: Iterable[str] = ()) -> str:
-        """YAML text of all settings that differ from the defaults; each decision has its reason as a comment.
+        """Return YAML text of all settings that differ from the defaults; each decision has its reason as a comment.
 
-        Sensors with an open question have their mapping alone. They are not ignored, so the
-        question is asked until it is answered.
+        Only the mapping of a sensor with an open question is written. The sensor is not
+        ignored, so the question is asked until it is answered.
         """
         comments = [item for part in self.parts for item in part.comments()]
         comments += [
@@ -245,7 +245,7 @@ def _overlaid(config: Config, given: Config) -> Config:
 
 
 def _leaves(values: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield the paths of the keys of topics and tables in nested mappings."""
+    """Yield the path of each setting inside the topics and tables of nested mappings."""
     if not isinstance(values, Mapping):
         yield path
         return
@@ -270,7 +270,7 @@ def _role(part: InputPart) -> Decision:
 
 
 def _unreadable(path: Path, kind: str, unused: Sequence[str]) -> InputSource:
-    """Return a source whose messages raise `DataError`, because nothing in it is recognised."""
+    """Return a source whose messages raise `DataError`, because no part of the recording is recognised."""
 
     def messages() -> Iterator[Message]:
         raise DataError(

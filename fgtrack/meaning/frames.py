@@ -62,7 +62,10 @@ def frame_of(points: Points, motion: EgoMotion) -> FrameTest:
 
 
 def _by_distance(points: Points) -> tuple[bool | None, str]:
-    """Return the frame in which the detections are near the ego, with the distances in words."""
+    """Return True if the detections are near the ego in the map, False in the ego's frame, None if undecided.
+
+    The text contains the distances.
+    """
     body_m = float(np.quantile(np.hypot(*points.points_m.T), 0.9))
     offsets_m = points.points_m - points.poses[:, :2]
     map_m = float(np.quantile(np.hypot(*offsets_m.T), 0.9))
@@ -78,7 +81,11 @@ def _by_distance(points: Points) -> tuple[bool | None, str]:
 
 
 def _by_motion(points: Points) -> tuple[bool | None, str]:
-    """Return the frame in which objects keep their velocity, with their deviations in words."""
+    """Return True if objects keep their velocity in the map, False if they keep it in the ego's frame, None if
+    undecided.
+
+    The text contains the deviations from constant velocity in both frames.
+    """
     gaps: list[FloatArray] = []
     for in_map in (False, True):
         read = points.read_in_map(in_map)
@@ -103,7 +110,7 @@ def _by_motion(points: Points) -> tuple[bool | None, str]:
 
 
 def _parts(chains: np.ndarray) -> list[np.ndarray]:
-    """Rows of each chain."""
+    """Return the rows of each chain. `chains` are the numbers of the chains by row."""
     return [
         np.flatnonzero(chains == number)
         for number in range(int(chains.max(initial=-1)) + 1)
@@ -142,7 +149,7 @@ def _deviations_m(points: Points, rows: np.ndarray) -> FloatArray:
 def _mean(
     times_s: FloatArray, values: FloatArray, at_s: float, width_s: float
 ) -> tuple[float, FloatArray] | None:
-    """Mean time and mean values around a time; None without values."""
+    """Return the mean time and the mean values within `width_s` around a time; None if there are no values."""
     near = np.abs(times_s - at_s) <= width_s
     return (
         (float(times_s[near].mean()), values[near].mean(axis=0)) if near.any() else None

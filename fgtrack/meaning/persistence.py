@@ -70,15 +70,17 @@ class Persistence:
     detection_probability: float
     clutter_per_list: float
     near_clutter_per_m2: float
-    """Density of clutter around clutter: in the next list if scores identify clutter, else in the same list."""
+    """Density of clutter near other clutter: in the next list if scores identify clutter, else in the same list."""
     score: Score | None
     """Score model; None if scores are missing, or higher scores do not belong to objects more often."""
     max_range_m: float | None
-    """Range beyond which most triples are not continued, so clutter outnumbers objects; None if continued anywhere."""
+    """Range beyond which most triples are not continued, so clutter outnumbers objects; None if there is no such
+    range.
+    """
     lines: FloatArray
     """Stamp, position and velocity at the end of each triple, shape (n, 5)."""
     std_m: float
-    """Standard deviation of a detection on each axis, of the errors that are independent from list to list."""
+    """Standard deviation of a detection on each axis; only errors that are independent from list to list count."""
     lists: Lists
 
 
@@ -194,10 +196,10 @@ def _crowding_per_m2(
     loose: BoolArray,
     of_clutter: float,
 ) -> float:
-    """Density of clutter around clutter in the same list.
+    """Density of clutter near other clutter of the same list.
 
     `loose` marks detections in no triple; `of_clutter` of them are clutter. `numbers`
-    contains the list of each detection.
+    contains the index of the list of each detection.
     """
     from scipy.spatial import cKDTree
 
@@ -230,9 +232,10 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
 def _near_clutter_per_m2(
     trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float
 ) -> float:
-    """Density of clutter in the next list around clutter, where scores give the probability of clutter.
+    """Density of clutter in a list near clutter of the list before.
 
-    `odds` are the odds of clutter before the score is known.
+    `model` and `scores` give the probability that a detection is clutter. `odds` are the
+    odds of clutter before the score is known. `trees` contain the positions of each list.
     """
     ratios = [
         np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale)

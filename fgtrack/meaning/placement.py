@@ -26,7 +26,7 @@ _WORDS = {"map": "the map", "ego": "the ego's frame", "sensor": "the sensor's fr
 
 
 def frame_decisions(sample: Sample) -> Iterator[Decision]:
-    """Yield the frame of each sensor, for sensors whose frame the user has not given."""
+    """Yield a decision on the frame of each sensor whose frame the user has not given."""
     points, motion = points_of(sample.messages, sample.config.ego.detection_origin_m)
     headers = _HeaderFrames(sample)
     for name in _sensors(sample):
@@ -119,7 +119,10 @@ def _topic_frame(
     points: Points | None,
     test: FrameTest | None,
 ) -> Iterator[Decision]:
-    """Yield the frame of a topic: by the odometry or tf, else by a test, with its header's name as the first guess."""
+    """Yield the decision on the frame of a topic: from the odometry or tf, else from a test.
+
+    The name of the header frame is the first guess of a test.
+    """
     header = headers.of(name)
     if header is None:
         if points is not None and test is not None:
@@ -173,7 +176,7 @@ def _unknown_frame(
     headers: _HeaderFrames,
     test: FrameTest | None,
 ) -> Iterator[Decision]:
-    """Yield the frame of a topic whose header frame nothing connects to the ego or the map."""
+    """Yield the decision on the frame of a topic whose header frame is connected to neither the ego nor the map."""
     key = (*path, "frame")
     question = f"in which frame is {frame_id}? Set {'.'.join(key)} (map, ego, sensor or optical)"
     if test is not None and test.is_contradictory:
@@ -200,7 +203,7 @@ def _unknown_frame(
 def _table_frame(
     name: str, path: tuple[str, ...], points: Points | None, test: FrameTest | None
 ) -> Iterator[Decision]:
-    """Yield the frame of a table without frames."""
+    """Yield the decision on the frame of a table without frames."""
     key = (*path, "frame")
     question = (
         f"in which frame are its positions? Set {'.'.join(key)} (map, ego or sensor)"
@@ -224,12 +227,13 @@ def _table_frame(
 
 
 def mount_decisions(sample: Sample) -> Iterator[Decision]:
-    """Yield the mount of each sensor on the ego: as estimated, or assumed where it is not observable.
+    """Yield a decision on the mount of each sensor on the ego.
 
-    A sensor whose header frame is unknown, and whose yaw no test shows, stays open. So
-    do sensors with ranges and bearings beside other sensors, if nothing shows their
-    mount. So do sensors with positions in frames that differ, if nothing shows which
-    frame is the ego's. A lone sensor, or sensors that agree, may be assumed in the ego.
+    The mount is estimated, or assumed if it is not observable. The decision stays open in
+    three cases: the header frame is unknown and no test shows the yaw of the sensor; the
+    sensor measures ranges and bearings beside other sensors, and nothing shows its mount;
+    positions of sensors are in different frames, and nothing shows which frame is the
+    ego's. A single sensor, or sensors that agree, may be assumed in the ego.
     """
     paths = {
         name: path
@@ -442,7 +446,7 @@ def _has_unknown_header(sample: Sample, name: str) -> bool:
 
 
 def plain_mount(pose: Pose2) -> dict[str, float]:
-    """Plain values of a mount, rounded."""
+    """Return the rounded values of a mount by name."""
     return {
         "x_m": round(pose.x_m, 2),
         "y_m": round(pose.y_m, 2),

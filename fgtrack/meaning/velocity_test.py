@@ -77,7 +77,7 @@ def _decision(
 
 
 def _used(raw: FieldPath, meaning: VelocityMeaning) -> FieldPath:
-    """Return the path, or the paths, with the conversion to m/s."""
+    """Return the path, or both paths, of a velocity with the conversion to m/s."""
     paths = paths_of(raw)
     unknown = raw.unknown if isinstance(raw, Field) else ()
     path: str | list[str] = paths[0] if len(paths) == 1 else paths
@@ -119,7 +119,10 @@ def _pair(item: Detection) -> tuple[float | None, float | None]:
 
 
 def _unit(raw: FieldPath) -> str | None:
-    """Unit of a field with a conversion; None without one."""
+    """Unit of speed whose conversion is the scale of a field.
+
+    None for a field without a scale, and for a scale that belongs to no unit.
+    """
     if not isinstance(raw, Field) or raw.scale == 1.0:
         return None
     return next(

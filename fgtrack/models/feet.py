@@ -68,11 +68,11 @@ def feet(
     left. `segments` (n, 20) are the segment rows of `TrackMap`, at most `longest_m`
     long.
 
-    The search starts at the row nearest to the point. The foot is the share t of a
-    segment at which the point lies on the normal: Re((q - t e) (B + t dB)) = 0. Here q
-    is the vector from the start of the segment to the point, and e is the segment. B is
-    exp(-i heading) at the start, and dB is its change along the segment. All are
-    complex numbers.
+    The foot lies in the nearest row, or in the row before it. There the share t of the
+    segment solves a quadratic equation: Re((q - t e) (B + t dB)) = 0. It is limited to
+    0 to 1. Here q is the vector from the start of the segment to the point, and e is the
+    segment. B is exp(-i heading) at the start, and dB is its change along the segment.
+    All are complex numbers.
     """
     check(
         len(segments) > 0

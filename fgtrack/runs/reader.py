@@ -193,7 +193,7 @@ class Run:
         )
 
     def with_tables(self, **tables: Columns) -> "Run":
-        """Return the run with these tables, by name, instead of its own."""
+        """Return the run in which `tables` replace the tables of the same names. Its other tables stay."""
         return replace(self, tables={**self.tables, **tables})
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> None:

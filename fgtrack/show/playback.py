@@ -219,16 +219,17 @@ _LINES = ("bound", "bound", "centre")  # kinds of the three lines of a road
 
 
 def _place(position_m: FloatArray, prefix: str = "") -> Json:
-    """Return the columns of positions (n, 2)."""
+    """Return the coordinates of positions (n, 2) as columns `x` and `y`, whose names begin with `prefix`."""
     return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
 
 
 def _thinned(
     tables: Sequence[Columns], time: str, most: int, label: str, notes: dict[str, None]
 ) -> list[Columns]:
-    """Return `tables`, thinned to every second, third, ... time of the first one if they exceed `most` rows.
+    """Return `tables`, thinned to every k-th time of the first table, so that about `most` rows remain.
 
-    A note on the thinning is added to `notes`.
+    Tables with at most `most` rows are returned unchanged. A note on the thinning is added
+    to `notes`.
     """
     num_rows = max(item.num_rows for item in tables)
     step = max(1, math.ceil(num_rows / most))

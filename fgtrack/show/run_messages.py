@@ -56,7 +56,7 @@ _USED = (*FUSED, Disposition.MERGED)
 
 @dataclass(frozen=True)
 class RunLayer:
-    """Topic prefix of a run, and the colour of its tracks."""
+    """Topic prefix of a run, and colour of its tracks."""
 
     prefix: str = ""
     colour: str | None = None
@@ -146,7 +146,9 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 
 def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
-    """Yield, for every tick, boxes with names and speeds, 2-sigma ellipses of the positions, and poses."""
+    """Yield three streams of messages over all ticks: boxes with names and speeds, 2-sigma ellipses of the positions,
+    and poses.
+    """
     tracks = with_position(run.tables["tracks"])
     states = _states(tracks, run.tables["objects"])
     axes = ellipses(tracks, _DEVIATIONS).tolist()
@@ -359,7 +361,7 @@ def _scenes(
 ) -> Messages:
     """Yield a scene for each time, with the entities of its rows.
 
-    Entities of the time before that are missing now are removed.
+    An entity of the scene before that is missing in this scene is removed.
     """
     before: set[str] = set()
     for at_ns, rows in rows_at:

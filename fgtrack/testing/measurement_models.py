@@ -56,7 +56,7 @@ class Case(NamedTuple):
 
 
 def check_measurement_models(seed: int = 0) -> None:
-    """Raise `BrokenPromiseError` unless all shipped measurement models are those of their definitions."""
+    """Raise `BrokenPromiseError` unless all shipped measurement models agree with their definitions."""
     for component in COMPONENTS:
         run_all(component, measurement_model_checks(component, seed))
 
@@ -64,7 +64,7 @@ def check_measurement_models(seed: int = 0) -> None:
 def measurement_model_checks(
     component: str, seed: int = 0
 ) -> dict[str, Callable[[], None]]:
-    """The checks of one of `COMPONENTS`, by name of the promise: for `pytest.mark.parametrize`."""
+    """Return the checks of one of `COMPONENTS` by name of the promise, for `pytest.mark.parametrize`."""
     names = {
         check.__name__.removeprefix("_").replace("_", " "): check for check in _CHECKS
     }
@@ -82,7 +82,7 @@ def _run(name: str, check: Callable[[Case], None], component: str, seed: int) ->
 
 
 def _cases(component: str, seed: int) -> Iterator[Case]:
-    """Random states and poses of every motion model whose state determines the component."""
+    """Yield random states and poses for every motion model whose state determines the component."""
     rng = np.random.default_rng(seed)
     for motion in _MOTIONS:
         names = tuple(
@@ -115,7 +115,7 @@ def _cases(component: str, seed: int) -> Iterator[Case]:
 
 
 def _equal(values: FloatArray, expected: FloatArray, what: str) -> None:
-    """Require that each entry of `values` is that of `expected`."""
+    """Require that `values` equals `expected` up to rounding."""
     values = np.asarray(values)
     require(
         values.shape == expected.shape,
@@ -129,7 +129,7 @@ def _equal(values: FloatArray, expected: FloatArray, what: str) -> None:
 
 
 def _measures_by_its_definition(case: Case) -> None:
-    """One state, and an array of states. Full turns of an angle do not count."""
+    """Check the predicted measurement of one state and of an array of states. Full turns of an angle do not count."""
     model, row = case.model, case.row
     z = model.predict(case.x, case.pose)
     _equal(_turned(case, z[row], case.expected.z[row]), np.zeros(()), "the measurement")
@@ -145,7 +145,7 @@ def _turned(case: Case, z: float, predicted: float) -> FloatArray:
 
 
 def _has_the_jacobian_of_its_definition(case: Case) -> None:
-    """By `jacobian` of one state and of two, by `linearised`, and by `selection` of a linear model."""
+    """Check `jacobian` for one state and for two, `linearised`, and `selection` of a linear model."""
     model, row, expected = case.model, case.row, case.expected.H[case.row]
     _equal(model.jacobian(case.x, case.pose)[row], expected, "jacobian")
     many = model.jacobian(np.stack([case.x, case.x]), case.pose)
@@ -160,7 +160,10 @@ def _has_the_jacobian_of_its_definition(case: Case) -> None:
 
 
 def _is_linear_where_the_state_has_it(case: Case) -> None:
-    """Compiled loops select the entries `selected` of the state, without a Jacobian."""
+    """Check that a component is linear if it is an entry of the state.
+
+    Compiled loops select the entries `selected` of the state, without a Jacobian.
+    """
     model = case.model
     known = all(name in model.state_names for name in model.components)
     require(model.linear == known, f"linear is {model.linear}")
@@ -178,7 +181,7 @@ def _has_the_pose_jacobian_of_its_definition(case: Case) -> None:
 
 
 def _differs_by_the_short_way_round(case: Case) -> None:
-    """An angle, by at most half a turn; any other component, by the plain difference."""
+    """Check the difference of two measurements: for an angle at most half a turn, else the plain difference."""
     predicted = case.expected.z
     for off in (-7.0, -3.0, 0.5, 3.0, 10.0):
         z = predicted + off
@@ -191,7 +194,10 @@ def _differs_by_the_short_way_round(case: Case) -> None:
 
 
 def _gives_back_the_position(case: Case) -> None:
-    """Position and covariance of x and y, or of range and bearing. The covariance is of first order."""
+    """Check the position that `measured_position` returns, and its covariance to first order.
+
+    A model with x and y, or with range and bearing, must give a position. Other models must give None.
+    """
     model, expected = case.model, case.expected
     R = np.diag(1e-4 * (1.0 + np.arange(len(model.components))))
     known = measured_position(model.components, expected.z, R, case.pose)
@@ -214,9 +220,10 @@ def _gives_back_the_position(case: Case) -> None:
 
 
 def _splits_an_error_that_is_correlated_in_time(case: Case) -> None:
-    """z = h(x) + G e + white noise, with errors e of variance 1 in the state. Both parts together have covariance R.
+    """Check z = h(x) + G e + white noise, with errors e of variance 1 in the state.
 
-    The measured components of a sensor have an error each. A position always has two components.
+    Both parts together have the covariance R. Each measured component of a sensor has its own error. A position always
+    has two components.
     """
     components, row, share = case.model.components, case.row, 0.7
     own = [name for name in components if name != "curvature_radpm"]

@@ -30,12 +30,12 @@ X, YAW, RANGE, BEARING, CURVATURE = map(
 
 
 class PosedBatch(NamedTuple):
-    """A batch, the sensor that it is of, and the pose that its detections are seen from."""
+    """A batch, its sensor, and the sensor pose from which its detections are measured."""
 
     batch: Batch
     sensor: SensorModel
     ego: EgoPose | None
-    """At the stamp of the batch; None where it is unknown."""
+    """Pose of the ego at the stamp of the batch; None if it is unknown."""
     pose: SensorPose
 
 
@@ -44,21 +44,21 @@ class MapDetections(NamedTuple):
 
     batches: Sequence[PosedBatch]
     poses: FloatArray
-    """Their poses, shape (batches, 5)."""
+    """Sensor poses of the batches, shape (batches, 5)."""
     starts: IntArray
     """First row of each batch, and the number m of all rows, shape (batches + 1,)."""
     indices: IntArray
-    """Indices in the message, shape (m,)."""
+    """Indices of the detections in their messages, shape (m,)."""
     values: FloatArray
-    """In the order of `COMPONENTS`, shape (m, 8); NaN where there is none."""
+    """Values in the order of `COMPONENTS`, shape (m, 8); NaN for a missing value."""
     points_m: FloatArray
-    """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
+    """Positions in the map, shape (m, 2); NaN if only a bearing was measured."""
     map_yaw: BoolArray
-    """True where the yaw is that of the map, shape (m,)."""
+    """True if the yaw is taken from the map, shape (m,)."""
     merged: Mapping[tuple[int, int], tuple[int, ...]] = MappingProxyType({})
-    """Indices of the detections that end as merged, by batch and index of the one which leads them."""
+    """Indices of the merged detections, by the batch and the index of the detection that leads them."""
     averaged: "Mapping[tuple[int, int], MapDetections]" = MappingProxyType({})
-    """Detections of which the values are averages, by batch and index of the leading one."""
+    """Detections whose values were averaged, by the batch and the index of the detection that leads them."""
 
     @property
     def of(self) -> IntArray:
@@ -66,7 +66,10 @@ class MapDetections(NamedTuple):
         return np.arange(len(self.batches)).repeat(np.diff(self.starts))
 
     def at(self, rows: IntArray | BoolArray) -> "MapDetections":
-        """Return the detections at `rows`, batch by batch."""
+        """Return the detections at `rows`: ascending indices, or a mask, over the detections of all batches.
+
+        Each detection stays in its batch.
+        """
         return self._replace(
             starts=self.of[rows].searchsorted(np.arange(len(self.starts))),
             indices=self.indices[rows],
@@ -215,7 +218,10 @@ def covariances(
 def _reading(
     names: tuple[str, ...],
 ) -> tuple[Callable[[Detection], Any], tuple[int, ...]]:
-    """Return a function that reads the components `names` of a detection, and their columns, filled up with -1."""
+    """Return a function that reads the components `names` of a detection, and their indices in `COMPONENTS`.
+
+    The indices are filled up with -1 to the length of `COMPONENTS`.
+    """
     columns = [*map(COMPONENTS.index, names), *[-1] * (len(COMPONENTS) - len(names))]
     read = attrgetter(*names)
     return read if len(names) > 1 else lambda detection: (read(detection),), tuple(
@@ -224,7 +230,7 @@ def _reading(
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
-    """R with its position blocks, and the correlations of the position with the rest, turned by `yaws_rad` (m,)."""
+    """Return the covariances R (m, k, k), turned by `yaws_rad` (m,): blocks of the position, and its correlations."""
     turns = np.zeros(R.shape)
     diagonal = np.arange(R.shape[-1])
     turns[:, diagonal, diagonal] = 1.0
@@ -262,18 +268,21 @@ class PoseError(NamedTuple):
 
 
 class Merge:
-    """Finds detections of one list that are the same object, and averages them."""
+    """Recognises detections of a list that are the same object, and averages them."""
 
     def apart(self, points_m: FloatArray, starts: IntArray) -> list[bool]:
-        """Return for each list, with the `points_m` (n, 2) from one of `starts` to the next, if none are one object."""
+        """Return True for each list in which all detections are different objects.
+
+        The points of a list are the rows of `points_m` (n, 2) between two successive `starts`.
+        """
         return [True] * (len(starts) - 1)
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """Members of all groups of `points_m` (n, 2), by the point that leads it."""
+        """Return the indices of all groups of `points_m` (n, 2), by the index of the point that leads the group."""
         return {row: (row,) for row in range(len(points_m))}
 
     def mean(self, name: str, values: FloatArray) -> float:
-        """Average of component `name`; of angles on the circle."""
+        """Return the average of the component `name`; angles are averaged on the circle."""
         return (
             circular_mean(values)
             if name in ANGULAR
@@ -314,7 +323,7 @@ class ConnectedMerge(Merge):
         return leads, apart
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """See `Merge.groups`; in the order of their first members, which lead."""
+        """See `Merge.groups`. The first member leads a group; groups are in the order of their first members."""
         leads, _ = self._linked(points_m, np.array([0, len(points_m)]))
         members: dict[int, list[int]] = {}
         for index, lead in enumerate(leads.tolist()):

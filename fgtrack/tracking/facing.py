@@ -69,18 +69,20 @@ _WORDS: "dict[int, YawWord]" = {
 
 
 class Facings(NamedTuple):
-    """Belief about the front of tracks, and the yaws of one sensor."""
+    """Log-odds of the fronts of tracks, and shares of right and wrong yaws of one sensor."""
 
     log_odds: FloatArray
-    """Of the yaw of the state being that of the front, without the evidence of the speed, shape (tracks,)."""
+    """Log-odds that the yaw of the state is the yaw of the front, without the evidence of the speed, shape
+    (tracks,).
+    """
     shares: FloatArray
-    """Probabilities that a yaw is right, half a turn off, and anything, shape (3,)."""
+    """Probabilities that a yaw is right, is half a turn off, and is arbitrary, shape (3,)."""
     cartesian: bool
     """True if the states have velocities instead of yaw and speed."""
 
 
 class Readings(NamedTuple):
-    """Ways to read detections of a group as those of tracks, their costs, and their evidence."""
+    """Readings of detections of a group as detections of tracks, with their costs and their evidence."""
 
     group: Group
     members: IntArray
@@ -90,27 +92,29 @@ class Readings(NamedTuple):
     codes: IntArray
     """Bits `HALF_TURN`, `WITHOUT_YAW`, `REVERSED`, or -1 outside the gate, shape (m,)."""
     costs: FloatArray
-    """Shape (m,)."""
+    """Costs of the association, shape (m,)."""
     evidence: FloatArray
     """Log-likelihood ratio of the front, probabilities that a yaw is half a turn off, and anything, shape (m, 3)."""
 
 
 class YawsRead(NamedTuple):
-    """Likeliest readings of detections, and the defects of their yaws."""
+    """Likeliest reading of each detection, and the defect of its yaw."""
 
     readings: IntArray
-    """Bits `HALF_TURN`, `WITHOUT_YAW`, `REVERSED`, shape (m,)."""
+    """Bits, shape (m,). `HALF_TURN`: the yaw is half a turn off. `WITHOUT_YAW`: the yaw is not used. `REVERSED`: the
+    yaw of the state is the yaw of the rear.
+    """
     words: "list[YawWord | None]"
-    """None of a yaw that is used as it is, and where none is measured."""
+    """Defect of each yaw; None for a yaw that is used as it was measured, and for a detection without a yaw."""
 
 
 class _Kind(NamedTuple):
     """Properties of measured components."""
 
     yaw: int
-    """Index of the yaw, -1 without one."""
+    """Index of the yaw; -1 without a yaw."""
     signed: BoolArray
-    """True of those in `SIGNED`, shape (k,)."""
+    """True for the components in `SIGNED`, shape (k,)."""
     is_read: bool
     """True if a detection may be read in several ways."""
 
@@ -251,7 +255,7 @@ class Facing(Stateful):
         """Numbers of yaws by sensor: all `yaws` of detections that tracks used, `flipped` yaws and `unused` yaws."""
 
     def at(self, sensor: str, track_ids: tuple[int, ...]) -> Facings:
-        """Return the belief about some tracks for the detections of `sensor`."""
+        """Return the log-odds of the fronts of tracks, and the shares of wrong yaws of `sensor`."""
         return Facings(
             self._log_odds[self._rows_of(track_ids)],
             self._shares_of(sensor),
@@ -277,7 +281,7 @@ class Facing(Stateful):
     def born(
         self, track_id: int, sensor: str, start: Start, first: Measurement
     ) -> None:
-        """Begin the belief about a track with this `start` of its `first` measurement, by `sensor`."""
+        """Begin the log-odds of a track with this `start`, from its `first` measurement, by `sensor`."""
         log_odds = 0.0 if start.yaw_rad is None else MOST_EVIDENCE
         if "yaw_rad" in first.model.components and "yaw_rad" not in first.assumed:
             right, flip, _ = self._shares_of(sensor).tolist()
@@ -389,7 +393,11 @@ class Facing(Stateful):
     def published(
         self, track_ids: tuple[int, ...], states: Sequence[TrackState]
     ) -> Sequence[TrackState]:
-        """Return the kinematic present `states` of tracks, with the yaw of the front; the belief is decided here."""
+        """Return the present kinematic `states` of tracks, with the yaw of the front.
+
+        The front of each track is decided here, from its log-odds and its speed; `seen` and `smoothed` keep the
+        decision.
+        """
         if not track_ids:
             return states
         if isinstance(states, States) and not self._is_any_turned:
@@ -414,7 +422,7 @@ class Facing(Stateful):
     def seen(
         self, track_ids: tuple[int, ...], states: Sequence[TrackState]
     ) -> Sequence[TrackState]:
-        """Return kinematic `states` of tracks at any stamp, with the yaw of what is published as their front."""
+        """Return kinematic `states` of tracks at any stamp, with the yaw of the front that `published` has decided."""
         return (
             turned(states, self._turned[self._rows_of(track_ids)])
             if self._is_any_turned
@@ -422,7 +430,7 @@ class Facing(Stateful):
         )
 
     def smoothed(self, reports: Sequence[SmoothedReport]) -> Sequence[SmoothedReport]:
-        """Return all smoothed `reports` of a tick, with the yaw of what is published as the front of their tracks."""
+        """Return all smoothed `reports` of a tick, with the yaw of the front that `published` has decided."""
         ended, self._ended = self._ended, set()
         if not (self._is_any_turned or ended):
             return reports
@@ -437,7 +445,7 @@ class Facing(Stateful):
         ]
 
     def forget(self, track_id: int) -> None:
-        """Forget a track that has ended, but for its last smoothed states."""
+        """Forget a track that has ended. Its decided front is kept for its last smoothed states."""
         row = self._rows.pop(track_id, None)
         if row is None:
             return  # its start was interrupted
@@ -449,7 +457,7 @@ class Facing(Stateful):
 
 
 def _learns(group: Group) -> bool:
-    """True if detections of `group` are evidence of the front: those with the heading of the map are not."""
+    """True if the yaws of `group` are evidence of the front. Yaws taken from the map are no evidence."""
     return "yaw_rad" not in group.stack.assumed
 
 
@@ -468,7 +476,9 @@ def _arrays(states: Sequence[TrackState]) -> tuple[FloatArray, FloatArray]:
 
 
 def turned(states: Sequence[TrackState], rows: BoolArray) -> States:
-    """Return kinematic `states`, those of `rows` (m,) as (yaw + pi, -speed, -acceleration): the same motion."""
+    """Return kinematic `states`. The states of `rows` (m,) become (yaw + pi, -speed, -acceleration): the same
+    motion.
+    """
     means, covariances = _arrays(states)
     means, covariances = means.copy(), covariances.copy()
     signs = np.ones(means.shape[1])

@@ -112,8 +112,9 @@ class GuardedBank(Stateful):
         )
 
     def state_of(self, track_id: int, stamp_ns: int) -> StatesAt:
-        """Return the state of one track at `stamp_ns`, see `states_at`; of no track where it has none.
-        A bank with `states_of` is asked for it alone.
+        """Return the state of one track at `stamp_ns`, see `states_at`; an empty `StatesAt` without a state.
+
+        If the bank has `states_of`, it computes only the state of this track.
         """
         bank: Any = self._bank  # Any: not each bank has `states_of`
         if not hasattr(bank, "states_of"):
@@ -220,7 +221,7 @@ class GuardedBank(Stateful):
             self._can_start = True
 
     def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`. A track that a failure has ended need not be there."""
+        """See `TrackBank.remove`. A track that a failure has ended already is ignored."""
         if track_id not in self._alive:
             return
         try:
@@ -238,7 +239,7 @@ class GuardedBank(Stateful):
         self._alive.pop(track_id, None)
 
     def present(self) -> Sequence[TrackState]:
-        """See `TrackBank.present`; all are sound."""
+        """See `TrackBank.present`. States with a fault are left out: their tracks end."""
         while True:
             try:
                 states, unsound = self._checked(self._bank.present())
@@ -257,7 +258,7 @@ class GuardedBank(Stateful):
                 )
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`; those that are not sound are left out."""
+        """See `TrackBank.smoothed`. States with a fault are left out."""
         try:
             reports = self._bank.smoothed()
             if not reports:
@@ -329,7 +330,7 @@ class GuardedBank(Stateful):
                 self.remove(track_id)
 
     def _start_over(self, error: Exception) -> None:
-        """Take a new bank, as the state of this one is unknown: all its tracks end."""
+        """Replace the bank by a new bank, because its state is unknown. All its tracks end."""
         self.failures.note(error)
         self._bank = self._make()
         for track_id in self._alive:

@@ -37,14 +37,16 @@ _MAX_FUTURE_NS = (
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The usable detections of one message, at the stamp that they are processed at."""
+    """The usable detections of one message that have the same stamp."""
 
     message: DetectionList
     stamp_ns: int
     indices: tuple[int, ...]
-    """Positions, in the message, of the detections to process."""
+    """Indices in the message of the detections to process."""
     last: bool = True
-    """True for the newest batch of its message; only detections with stamps of their own make several."""
+    """True for the newest batch of its message. A message has several batches only if its detections have own
+    stamps.
+    """
     since_ns: int | None = None
     """First tick at which the batch had to wait, see `Inbox.due`; None if it never had to."""
 
@@ -83,7 +85,7 @@ def record(
 
 
 def records(message: DetectionList, disposition: Disposition) -> list[UpdateRecord]:
-    """The same disposition for every detection of `message`."""
+    """Return a record with the same disposition for each detection of `message`."""
     return [
         record(message, index, disposition) for index in range(len(message.objects))
     ]
@@ -92,21 +94,24 @@ def records(message: DetectionList, disposition: Disposition) -> list[UpdateReco
 def merged_records(
     message: DetectionList, indices: Iterable[int], track_id: int | None
 ) -> list[UpdateRecord]:
-    """The records of the detections `indices` that were merged into another one, of a track if there is one."""
+    """Return the records of the detections `indices`, which were merged into another detection.
+
+    `track_id` is the track of the other detection; None if it has no track.
+    """
     return [record(message, index, Disposition.MERGED, track_id) for index in indices]
 
 
 @dataclass(frozen=True, slots=True)
 class FusedRecords:
-    """The records of matched detections, and of those merged into each; made whenever they are asked for."""
+    """The records of matched detections, and of the detections merged into each; made at each iteration."""
 
     message: DetectionList
     matched: Sequence[tuple[int, int, Measurement | None, UpdateResult]]
-    """Index and track of each, its measurement, or one like it, and the outcome."""
+    """Index and track of each matched detection, its measurement (or one like it), and the result of the update."""
     merged: Mapping[int, tuple[int, ...]]
-    """Indices of the detections that were merged into each, by its index."""
+    """Indices of the detections that were merged into a matched detection, by the index of the matched detection."""
     yaws: Sequence[YawWord | None]
-    """Words on the yaws of the matched ones."""
+    """Defect of the yaw of each matched detection; None for a yaw without a defect."""
 
     def __iter__(self) -> Iterator[UpdateRecord]:
         for (index, track_id, measurement, result), yaw in zip(
@@ -173,7 +178,11 @@ def is_valid_covariance(detection: Detection, sensor: SensorModel) -> bool:
 
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
-    """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
+    """Return the stamp of each detection of `message`, as `sensor.stamp_from` selects.
+
+    It is the stamp of the list, the detection's own stamp, or the mean of all own stamps. The stamp of the list
+    replaces an own stamp that is missing.
+    """
     if sensor.stamp_from not in ("object", "objects_mean"):
         return [message.stamp_ns] * len(message.objects)
     own = [each.stamp_ns for each in message.objects if each.stamp_ns is not None]
@@ -191,7 +200,7 @@ _Origin = tuple[str, str | None, float | None, float | None]
 
 
 def _origin(sensor: str, detection: Detection) -> _Origin:
-    """Sensor, identity and position, which copies of one message have in common."""
+    """Return sensor, identity and position of a detection, which all copies of the detection have in common."""
     return sensor, detection.id, detection.x_m, detection.y_m
 
 
@@ -201,9 +210,9 @@ _values = attrgetter(*(each.name for each in fields(Detection)))
 def _key(
     message: DetectionList, usable: Sequence[bool]
 ) -> tuple[str, int, Frame, bytes]:
-    """Return what a message has in common with its copies.
+    """Return a key that is equal for all copies of a message.
 
-    These are its usable detections, in any order, by their bits: NaN equals nothing.
+    The key contains the sensor, the stamp, the frame, and the bits of the usable detections in any order.
     """
     values = list(map(_values, compress(message.objects, usable)))
     try:
@@ -221,7 +230,8 @@ def _key(
 
 
 class Inbox(Stateful):
-    """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections.
+    """Keeps every message until it is processed. Refuses messages that are repeated, too late or in the future.
+    Refuses single detections that are invalid, too.
 
     An interrupt loses no detection and counts none twice. One statement assigns all that a message changes, and no
     interrupt comes inside a statement that calls nothing.
@@ -238,7 +248,7 @@ class Inbox(Stateful):
     def __init__(
         self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0
     ) -> None:
-        """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
+        """`memory_s`: time for which a list is remembered; at least the largest delay of a list."""
         self._sensors = sensors
         self._max_delay_ns = {
             name: nanoseconds(sensor.max_delay_s)
@@ -258,9 +268,9 @@ class Inbox(Stateful):
         self._originals: dict[_Origin, DetectionList] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
-        """Receive a message; return the records of detections that end here.
+        """Receive a message. Return the records of the detections that are not processed further.
 
-        A message is repeated if an earlier one of the sensor had its stamp and contents.
+        A message is repeated if an earlier message of the sensor had its stamp and contents.
         """
         sensor = self._sensors[message.sensor]
         at_origin = message.origin_deg is not None
@@ -287,7 +297,7 @@ class Inbox(Stateful):
         return ended
 
     def _forget_lists(self, receipt_ns: int) -> None:
-        """Forget the lists that were received long before `receipt_ns`."""
+        """Forget the lists that were received more than `memory_s` before `receipt_ns`."""
         oldest_ns, receipts_ns = receipt_ns - self._memory_ns, self._receipts_ns
         while receipts_ns and receipts_ns[first := next(iter(receipts_ns))] < oldest_ns:
             del receipts_ns[first]
@@ -295,7 +305,9 @@ class Inbox(Stateful):
     def _sorted(
         self, message: DetectionList, usable: Sequence[bool]
     ) -> tuple[list[UpdateRecord], list[Batch]]:
-        """Return the records of the detections of `message` that end here, and all batches that wait from now on."""
+        """Return the records of detections of `message` that are not processed further, and all batches that then
+        wait.
+        """
         sensor, pending = self._sensors[message.sensor], self.pending.copy()
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
@@ -321,7 +333,10 @@ class Inbox(Stateful):
         return ended, pending
 
     def _fate(self, message: DetectionList, stamp_ns: int) -> Disposition | None:
-        """Return how detections of `message` with this stamp end that are too late, or stamped in the future."""
+        """Return the disposition of the detections of `message` with this stamp, if they cannot be used; else None.
+
+        Detections with a delay above the limit of the sensor are too old. Detections stamped in the future are invalid.
+        """
         delay_ns = message.receipt_ns - stamp_ns
         if delay_ns < -_MAX_FUTURE_NS:
             return Disposition.INVALID
@@ -372,11 +387,11 @@ class Inbox(Stateful):
 
     @property
     def held_ns(self) -> int:
-        """Oldest stamp of the pending batches; `FOREVER` without any."""
+        """Oldest stamp of the pending batches; `FOREVER` if no batch is pending."""
         return min((batch.stamp_ns for batch in self.pending), default=FOREVER)
 
     def collect(self) -> list[Batch]:
-        """Return all pending batches, oldest stamp first, and forget them and the records."""
+        """Return all pending batches, oldest stamp first. Forget the batches and the records."""
         ready, self.pending, self.ended = self.due()[0], [], []
         return ready
 

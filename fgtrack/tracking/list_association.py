@@ -31,8 +31,10 @@ class ListAssociation:
     def identified(
         self, batch: Batch, candidates: Candidates
     ) -> tuple[StatesAt, Assignment] | None:
-        """Return the track with the identity of the only candidate, its state and the pair; None outside its gate.
-        Identities that are seldom wrong need no other track: the cost does not depend on the number of tracks.
+        """Return the state of the track with the identity of the only candidate, and the assignment to this track.
+
+        None unless the identity is seldom wrong and belongs to one track, and the candidate lies inside the gate of
+        this track. The cost does not depend on the number of tracks.
         """
         parts, message = self._parts, batch.message
         sensor = parts.sensors[message.sensor]
@@ -81,7 +83,7 @@ class ListAssociation:
         states: StatesAt,
         evidence: Apart | None,
     ) -> Likely | None:
-        """Return the test of pairs against clutter and new objects; None where no pair is tested."""
+        """Return the test of pairs against clutter and new objects; None if no pair is tested."""
         weigh, tests = self._parts.weigh_births, list[Likely]()
         if weigh is not None and all(
             group.stack.model.components == ("x_m", "y_m")
@@ -108,7 +110,10 @@ class ListAssociation:
         evidence: Apart | None,
         pairs: Pairs,
     ) -> BoolArray:
-        """True of pairs, but of those of `newborn` tracks that clutter or a new object explains better, shape (m,)."""
+        """Return True for each of `pairs` that is kept, shape (m,).
+
+        A pair with one of the `newborn` tracks is not kept if clutter or a new object explains the candidate better.
+        """
         result = np.ones(len(pairs.rows), dtype=bool)
         placed = np.array(
             [candidates.placed[row] for row in pairs.rows.tolist()], dtype=bool
@@ -139,7 +144,9 @@ class ListAssociation:
         return self._parts.objects.evidence(described, states.track_ids, wrong)
 
     def _facings(self, batch: Batch, states: StatesAt) -> Facings | None:
-        """Return the belief about the fronts of the tracks; None where every yaw is taken as it is."""
+        """Return the log-odds of the fronts of the tracks, and the shares of wrong yaws; None if every yaw is used
+        as it was measured.
+        """
         facing = self._parts.facing
         return (
             None
@@ -150,7 +157,10 @@ class ListAssociation:
     def joint(
         self, batch: Batch, candidates: Candidates, states: StatesAt
     ) -> Pairs | None:
-        """Probabilities that candidates belong to tracks with enough detections; None where they are not considered."""
+        """Return the probabilities that candidates belong to tracks, for tracks with enough detections.
+
+        None if the association is not configured to compute them.
+        """
         rule = self._parts.joint
         if rule is None or rule.joint_from is None:
             return None
@@ -170,11 +180,12 @@ class ListAssociation:
     def claimed_by_younger(
         self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt
     ) -> tuple[StatesAt, Assignment] | None:
-        """Return the assignment of `new` candidates to the tracks that began after the batch's stamp; None without any.
+        """Return the states of the tracks that began after the stamp of `batch`, and the assignment of `new`
+        candidates to them.
 
-        Such a track was started by a newer detection that arrived earlier. Its candidates are too old for it, and are
-        no new object. The candidates are compared with the present states of these tracks, moved back to the stamp.
-        `states` are those of the other tracks. The states of the younger tracks are returned too.
+        None if there are no such tracks. Each of them was started by a newer detection that arrived earlier. A
+        candidate of the same object is too old for the track, and is no new object. The present states of these tracks
+        are moved back to the stamp and compared with the candidates. `states` are the states of the other tracks.
         """
         bank, motion = self._parts.bank, self._parts.motion
         now = bank.states_at(bank.present_ns)

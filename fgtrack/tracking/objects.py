@@ -52,7 +52,12 @@ class Evidence:
         own: IntArray,
         wrong_id_probability: float,
     ) -> None:
-        """`theirs` and `own` number the identities of the detections and of the tracks, 0 of none."""
+        """Collect the evidence.
+
+        `classes` is a test of pairs for different classes; None if all classes agree. `theirs` (detections,) and `own`
+        (tracks,) are the numbers of the identities; 0 is a missing identity. `wrong_id_probability` is the probability
+        that an identity is wrong.
+        """
         self._classes, self._theirs, self._own = classes, theirs, own
         self.weight = 2.0 * math.log(
             (1.0 - wrong_id_probability) / wrong_id_probability
@@ -60,11 +65,11 @@ class Evidence:
         """Twice the log-likelihood ratio of equal against different identities."""
 
     def __call__(self, rows: IntArray, columns: IntArray) -> BoolArray:
-        """True of pairs that differ in class or identity."""
+        """Return True for each pair that differs in class or identity, shape (m,)."""
         return self.differ(rows, columns) | (self.nis(rows, columns) > 0.0)
 
     def differ(self, rows: IntArray, columns: IntArray) -> BoolArray:
-        """True of pairs that differ in class."""
+        """Return True for each pair that differs in class, shape (m,)."""
         return (
             np.zeros(len(rows), dtype=bool)
             if self._classes is None
@@ -72,7 +77,10 @@ class Evidence:
         )
 
     def nis(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        """Addition to the NIS of the pairs, shape (m,): `weight` of different identities, minus it of equal ones."""
+        """Return the addition to the NIS of each pair, shape (m,).
+
+        It is `weight` for different identities, -`weight` for equal identities, and 0 if an identity is missing.
+        """
         a, b = self._theirs[rows], self._own[columns]
         return np.where(
             (a == _UNKNOWN) | (b == _UNKNOWN),
@@ -117,7 +125,7 @@ class Objects(Stateful):
         return any(map(_NO_DESCRIPTION.__ne__, map(_description, detections)))
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
-        """Add detections of the track."""
+        """Learn class, size and identity of the track from `detections`."""
         for detection in detections:
             if not self.describes([detection]):
                 continue
@@ -147,7 +155,11 @@ class Objects(Stateful):
                     )
 
     def owner(self, detection: Detection) -> int | None:
-        """Return the one track with the identity of `detection`; None without any, and where its class decides."""
+        """Return the only track with the identity of `detection`.
+
+        None if no track or several tracks have the identity. None also for a detection with a class, because the class
+        decides.
+        """
         if detection.id is None or detection.class_name is not None:
             return None
         tracks = self._owners.get(detection.id, ())
@@ -159,7 +171,7 @@ class Objects(Stateful):
         track_ids: Sequence[int],
         wrong_id_probability: float,
     ) -> Apart | None:
-        """Return the evidence of classes and identities on pairs of detections and tracks; None without any."""
+        """Return the evidence of classes and identities on pairs of detections and tracks; None without evidence."""
         if not self._seen:
             return None
         detections = list(detections)
@@ -235,7 +247,7 @@ class Objects(Stateful):
         return differ
 
     def reports(self, track_ids: Iterable[int]) -> list[ObjectReport | None]:
-        """Class and size of the object of each track; None if no detection has reported any."""
+        """Return class and size of the object of each track; None if no detection has reported them."""
         return [
             self._report(self._seen[i]) if i in self._seen else None for i in track_ids
         ]

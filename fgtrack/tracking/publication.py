@@ -12,15 +12,15 @@ from fgtrack.tracking.tracks import Tracks
 
 
 class Publication:
-    """Makes the reports of tracks, of those that are not suspended, with the yaw of their fronts."""
+    """Makes the reports of tracks, with the yaw of their fronts. Suspended tracks have no report."""
 
     def __init__(self, parts: TrackerParts, tracks: Tracks) -> None:
         self._parts, self._tracks = parts, tracks
 
     def present(self) -> Callable[[], Iterable[TrackReport]]:
-        """Return a factory of the reports of all tracks at present; their states are decided now.
+        """Return a function that makes the reports of all tracks at present. Their states are fixed at this call.
 
-        Tracks end whose states cannot be published.
+        Tracks whose states cannot be published end.
         """
         parts = self._parts
         states = parts.bank.present()
@@ -42,7 +42,10 @@ class Publication:
         return reports if facing is None else facing.smoothed(reports)
 
     def at(self, states: StatesAt, stamp_ns: int) -> tuple[TrackReport, ...]:
-        """Return the reports of tracks with these states at a stamp, of those whose states are sound."""
+        """Return the reports of tracks at a stamp, from their `states` at this stamp.
+
+        Suspended tracks, and states with a fault (see `faults`), are left out.
+        """
         parts = self._parts
         states = states.without(parts.lifecycle.suspended())
         if not states.track_ids:
@@ -58,7 +61,7 @@ class Publication:
     def _reports(
         self, track_ids: Sequence[int], states: Sequence[TrackState]
     ) -> Callable[[], Iterable[TrackReport]]:
-        """Return a factory of track reports; status, probability and counters are captured now."""
+        """Return a function that makes track reports. Status, probability and counters are fixed at this call."""
         parts = self._parts
         statuses, probabilities = parts.lifecycle.reported(track_ids)
         num_measured = list(map(self._tracks.num_measured.__getitem__, track_ids))

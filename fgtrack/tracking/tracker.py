@@ -217,7 +217,7 @@ class MultiObjectTracker:
         )
 
     def finish(self) -> tuple[SmoothedReport, ...]:
-        """End all tracks; gives the final smoothed states that were still inside a window.
+        """End all tracks. Return the final smoothed states that were still inside a window.
 
         Lists that still wait for an ego message are processed first; `last_updates` has their records.
         """
@@ -230,8 +230,10 @@ class MultiObjectTracker:
         return tuple(self._publication.smoothed())
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
-        """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
-        Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
+        """Return the report of a track at any stamp in or after its window.
+
+        The state is smoothed or filtered in the past, and predicted in the future. Raises `CallError` for a track that
+        does not exist, for a stamp before its window, and for a state that is not finite.
         """
         self._check_exists(track_id)
         bank, motion = self._parts.bank, self._parts.motion
@@ -240,12 +242,14 @@ class MultiObjectTracker:
         for track in self._publication.at(states, stamp_ns):
             return track
         raise CallError(
-            f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite"
+            f"track {track_id} has no state at {stamp_ns} ns: "
+            "the stamp lies before its window, or the state is not finite"
         )
 
     def window(self, track_id: int) -> "Window":
-        """A copy of the window of a track. Raises `CallError` for a track that does not exist, and unless the estimator
-        is a smoother.
+        """Return a copy of the window of a track.
+
+        Raises `CallError` for a track that does not exist, and for an estimator that is not a smoother.
         """
         self._check_exists(track_id)
         return self._parts.bank.window(track_id)
@@ -262,12 +266,12 @@ class MultiObjectTracker:
             )
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
-        """All tracks that have a state at a stamp, see `state_at`, in order of birth."""
+        """Return the reports of all tracks that have a state at a stamp, in order of birth, see `state_at`."""
         states = states_of(self._parts.bank, self._parts.motion, stamp_ns)
         return self._publication.at(states, stamp_ns)
 
     def _expire(self, now_ns: int, processed_ns: int) -> None:
-        """End tracks by the time that has passed, where all lists before `processed_ns` that came are processed."""
+        """End tracks whose time has passed. All received lists before `processed_ns` have been processed."""
         parts = self._parts
         try:
             watermarks_ns = parts.watermarks.at(now_ns, parts.bank.window_start_ns)
@@ -289,7 +293,7 @@ class MultiObjectTracker:
         return True
 
     def _posed(self, batch: Batch) -> PosedBatch:
-        """Return `batch` with the pose that it is seen from; detections in the map need none."""
+        """Return `batch` with the sensor pose from which it is measured. Detections in the map need no pose."""
         parts, sensor = self._parts, self._parts.sensors[batch.message.sensor]
         try:
             if places(batch, sensor):
@@ -306,7 +310,11 @@ class MultiObjectTracker:
     def _preprocessed(
         self, batches: Sequence[PosedBatch]
     ) -> Sequence[Preprocessed | None]:
-        """Candidates of `batches` in one pass; of a pass that fails nothing, so that one batch does not fail others."""
+        """Return the candidates of `batches`, computed in one pass.
+
+        If the pass raises, the entries are None. Each batch is then preprocessed by itself, so that one batch does not
+        fail other batches.
+        """
         try:
             return self._parts.preprocess.together(batches)
         except Exception as error:
@@ -329,8 +337,9 @@ class MultiObjectTracker:
         self._close()
 
     def _fail_rest(self) -> None:
-        """Let those detections of the batch that was begun end as failed that have no record.
-        Where that is interrupted, or has not enough memory, it is repeated in the next tick.
+        """Record the remaining detections of the batch that was begun as failed.
+
+        If this is interrupted, or lacks memory, the next tick repeats it.
         """
         if self._begun is not None:
             first, batch = self._begun
@@ -349,7 +358,7 @@ class MultiObjectTracker:
             self._begun = None
 
     def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
-        """One object list, at its own stamp: associate, count matches, update, count misses, give birth."""
+        """Process one object list at its stamp: associate, count matches, update, count misses, start tracks."""
         parts, batch, ego = self._parts, posed.batch, posed.ego
         message = batch.message
         if ego is None and message.frame != "map":
@@ -429,7 +438,7 @@ class MultiObjectTracker:
         return batch.stamp_ns < self._parts.bank.window_start_ns
 
     def _offered(self, batch: Batch) -> StatesAt:
-        """The tracks that `batch` may be associated with, at its stamp."""
+        """Return the states of the tracks that `batch` may be associated with, at its stamp."""
         ended = self._parts.lifecycle.suspended(batch.stamp_ns)
         states = self._parts.bank.states_at(batch.stamp_ns)
         if ended:
@@ -439,7 +448,10 @@ class MultiObjectTracker:
     def _ranges_m(
         self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None
     ) -> FloatArray:
-        """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
+        """Return the distances of tracks at `positions_m` (n, 2) from the ego, both at the stamp of the batch.
+
+        All distances are 0 without an ego.
+        """
         if ego is None:
             return np.zeros(len(track_ids))
         return np.asarray(
@@ -454,7 +466,7 @@ class MultiObjectTracker:
         states: StatesAt,
         scan: Scan,
     ) -> None:
-        """Lives of matched tracks, where it is positions that are seen, and the objects that detections describe."""
+        """Count the matches of tracks. Learn class, size and identity from the detections."""
         seen = self._seen.setdefault(id(batch.message), set())
         for _, track in assignment.pairs:
             seen.add(states.track_ids[track])

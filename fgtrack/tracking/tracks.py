@@ -18,7 +18,7 @@ from fgtrack.tracking.parts import TrackerParts
 
 
 class Tracks(Stateful):
-    """Numbers of the tracks, of the detections that have changed their states, and their first positions."""
+    """Numbers of the tracks, numbers of detections that have changed their states, and their first positions."""
 
     STATE: ClassVar[tuple[str, ...]] = (
         "_next_id",
@@ -52,14 +52,17 @@ class Tracks(Stateful):
         return track_id
 
     def begin(self, track_id: int, sensor: str, prior: Start) -> None:
-        """Note a track that a first detection of `sensor` has started."""
+        """Note a track that the first detection of `sensor` has started."""
         if prior.yaw_rad is None and not self._parts.motion.cartesian:
             self._undirected[track_id] = prior
         self.num_measured[track_id] = 1
         self._newborn[track_id] = sensor, FOREVER
 
     def end(self, track_ids: Sequence[int]) -> None:
-        """End tracks. A track whose end raises is forgotten as well, and the remaining tracks still end."""
+        """End tracks. An exception at the end of a track is counted as a failure.
+
+        The track is forgotten nevertheless, and the remaining tracks end.
+        """
         parts = self._parts
         for track_id in track_ids:
             self._undirected.pop(track_id, None)
@@ -79,7 +82,10 @@ class Tracks(Stateful):
                     parts.contain(error, Failure.STEP_FAILED)
 
     def forget_first(self, oldest_ns: int) -> None:
-        """Forget the first positions of tracks whose second one no late list can precede."""
+        """Forget the first positions of tracks whose second position is older than `oldest_ns`.
+
+        No late list can be older than this stamp.
+        """
         if self._newborn:
             self._newborn = {
                 i: each for i, each in self._newborn.items() if each[1] >= oldest_ns
@@ -90,11 +96,11 @@ class Tracks(Stateful):
             }
 
     def is_undirected(self, track_id: int) -> bool:
-        """True of a track with one position and an unknown heading."""
+        """True for a track with one position and an unknown heading."""
         return track_id in self._undirected
 
     def in_any_direction(self, states: StatesAt, stamp_ns: int) -> StatesAt:
-        """Return `states` at `stamp_ns`, those without a second position as uncertain in any direction."""
+        """Return `states` at `stamp_ns`. States of tracks without a second position are uncertain in all directions."""
         if not (self._undirected or self._directed):
             return states
         return in_any_direction(states, stamp_ns, self._undirected, self._directed)
@@ -102,10 +108,11 @@ class Tracks(Stateful):
     def newborn_of_others(
         self, sensor: str, stamp_ns: int, track_ids: Sequence[int]
     ) -> BoolArray | None:
-        """True of tracks with one position so far, or up to the stamp, of a list of another sensor, shape (m,).
+        """Return True for each track with one position up to the stamp, which another sensor with `scan` gave, shape
+        (m,).
 
-        The next list of that sensor shows the object again. Until then its velocity is unknown, and the gate wide.
-        None where there is no such track.
+        The next list of the other sensor shows the object again. Until then its velocity is unknown, and its gate is
+        wide. None if there is no such track.
         """
         if not self._newborn:
             return None

@@ -277,7 +277,10 @@ def test_a_message_without_a_list_is_one_object_and_without_a_header_has_no_stam
     [
         ({"x_m": "a.b"}, r"^a\.b: there is no field 'b'; there are no fields$"),
         ({"x_m": "text"}, "^text: 'far' is not a number$"),
-        ({"objects": "a", "x_m": "a"}, "^a: is not a list of objects$"),
+        (
+            {"objects": "a", "x_m": "a"},
+            "^a: is not a list of objects, give the path of a list$",
+        ),
         ({"class_name": ["a", "text"]}, "a single field is needed"),
     ],
 )

@@ -113,5 +113,7 @@ def test_a_pipe_or_device_is_refused_at_once(
     tmp_path: Path, make: Callable[[Path], None]
 ) -> None:
     make(tmp_path / "x.jsonl")
-    with pytest.raises(DataError, match=r"x\.jsonl: is neither a file nor a folder"):
+    with pytest.raises(
+        DataError, match=r"x\.jsonl: exists, but is neither a file nor a folder"
+    ):
         open_input(tmp_path / "x.jsonl")

@@ -24,7 +24,7 @@ _KALMAN = "fgtrack.estimation.kernels.kalman"
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the covariance F P F' + Q of F x + N(0, Q), shape (..., m, m)."""
+    """Return the covariance F P F' + Q of F x + w, where x has the covariance P and w has Q, shape (..., m, m)."""
     return symmetrise(congruence(F, P) + Q)
 
 
@@ -55,7 +55,7 @@ class Correction(NamedTuple, Generic[T]):
     covariance: FloatArray
     """Posterior covariance, shape (n, n)."""
     innovation: FloatArray
-    """Shape (k,)."""
+    """Measured minus predicted values, shape (k,)."""
     nis: T
     """Normalised innovation squared."""
     weight: T
@@ -101,7 +101,7 @@ def predict_across(
     motion: MotionModel,
     dt_s: FloatArray | float,
 ) -> Prediction:
-    """Return `predict`, together with the cross-covariance F P of both states."""
+    """Return the prediction of `predict`, with the cross-covariance F P of the predicted state and the state before."""
     after, F, Q = motion.transition(mean, dt_s)
     shape, n = Q.shape, Q.shape[-1]
     F, P, Q = (

@@ -22,7 +22,7 @@ class IekfReplay(ReplayEkf):
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
     38(2), 1993. The update minimises half of |x - x_0|^2 in P^-1 plus half of |z - h(x)|^2 in R^-1. A robust loss
     replaces the second term. A step that does not lower this sum is halved. The iteration ends with a step below 1e-6
-    standard deviations of the prediction. A linear measurement is fused as by `ReplayEkf`.
+    standard deviations of the prediction. A linear measurement is fused as in `ReplayEkf`.
     """
 
     iterates = True
@@ -68,9 +68,9 @@ def descended(
     start: FloatArray,
     end: FloatArray,
 ) -> FloatArray:
-    """First point on the way back from `end` (n,) to `start` (n,) whose `cost` is at most `limit`; else `start`.
+    """Return the first of `end` (n,) and the points halfway back to `start` (n,) whose `cost` is at most `limit`.
 
-    The step from `start` is halved until the cost is low enough.
+    The step from `start` is halved until the cost is low enough. Returns `start` if it stays too high.
     """
     step = end - start
     for _ in range(_MAX_HALVINGS):

@@ -333,10 +333,10 @@ class ReplayBank(Stateful):
     def _states(
         self, stamp_ns: int, is_present: bool = False
     ) -> tuple[BoolArray | None, FloatArray, FloatArray]:
-        """Return a mask (m,) of the tracks with a state at `stamp_ns`, means (m, n) and covariances (m, n, n)
-        of all tracks.
+        """Return the states of all tracks at `stamp_ns`: a mask (m,), means (m, n) and covariances (m, n, n).
 
-        The mask is None if all tracks have a state.
+        The mask is True for tracks with a state, and None if all tracks have a state. The rows of the other tracks have
+        arbitrary values. If `is_present`, a track that begins after the stamp has its first state.
         """
         if self._order is None:
             self._order = np.array([*self._rows.values()], dtype=np.int64)
@@ -348,8 +348,10 @@ class ReplayBank(Stateful):
     def _ahead(
         self, rows: IntArray, stamp_ns: int, is_present: bool = False
     ) -> tuple[int, BoolArray, FloatArray, FloatArray]:
-        """Return the states of the tracks in `rows` at `stamp_ns`: their number, a mask of the tracks with a
-        state, means and covariances. See `fgtrack.estimation.kernels.replay.ahead`.
+        """Return the states of the tracks in `rows` at `stamp_ns`: number of tracks with a state, mask of these
+        tracks, means and covariances.
+
+        The arguments and arrays are described in `fgtrack.estimation.kernels.replay.ahead`.
         """
         m, n = len(rows), self._motion.dim
         known, means, covariances = (

@@ -55,7 +55,7 @@ class TrackInitiation:
     fixes: tuple[Fix, ...] = ()
     """Measured positions; the first one is the position of the start."""
     line: Line | None = None
-    """Line through the fixes; None if all fixes have the same time."""
+    """Line through the fixes; None if all fixes have the same time, or if a fix has no error."""
 
     @classmethod
     def of(
@@ -119,7 +119,7 @@ class TrackInitiation:
         """Return the start with the direction and the speed of the line, and with its own uncertainty.
 
         The measurements are fused from this start. The speed counts a little more than once if the line and the
-        start are about equally certain of the speed. Raises as `state`.
+        start are about equally certain of the speed. Raises the exceptions of `state`.
         """
         yaw_rad, speed_mps = self._course()
         std_rad = (
@@ -173,7 +173,7 @@ class TrackInitiation:
         """Return the state (n,) on the line at the start. Entries that the line does not determine are taken
         from x (n,).
 
-        Raises as `state` without a line.
+        Raises `numpy.linalg.LinAlgError` if there is no line.
         """
         yaw_rad, speed_mps = self._course()
         motion = (
@@ -194,7 +194,9 @@ class TrackInitiation:
         A short line may have a wrong speed.
         """
         if self.line is None:
-            raise np.linalg.LinAlgError("no line leads through the first positions")
+            raise np.linalg.LinAlgError(
+                "the first positions determine no line: they have the same time, or one has no error"
+            )
         yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
         along = np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
         P, R = self.start.speed_std_mps**2, float(along @ self.line.covariance @ along)

@@ -67,8 +67,9 @@ _VECTORS, _MATRICES, _READ = (
 def marginal_nis(
     S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray
 ) -> float:
-    """Return the NIS of the `rows` of y (k,) with covariance S; NaN if the covariance of these rows is not positive
-    definite.
+    """Return the NIS of the components `rows` of y (k,) with covariance S (k, k).
+
+    NaN if the covariance of these components is not positive definite. `root` and `white` are scratch.
     """
     for a in range(len(rows)):
         white[a] = y[rows[a]]
@@ -264,11 +265,10 @@ def innovations(
     R: FloatArray,
     rows: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the covariances S = H P H' + R (m, k, k) of innovations y (m, k), and NIS and log det S of their
-    `rows`, (m,).
+    """Return the covariances S = H P H' + R (m, k, k) of innovations y (m, k), their NIS (m,) and log det S (m,).
 
-    Jacobians H are (m, k, n) or (1, k, n), covariances P (tracks, n, n) and R (m, k, k). The NIS is NaN if S is not
-    positive definite.
+    Jacobians H are (m, k, n) or (1, k, n), covariances P (tracks, n, n) and R (m, k, k). `tracks` (m,) are indices in
+    P. The NIS and log det S are those of the components `rows` of y. The NIS is NaN if S is not positive definite.
     """
     m, k = y.shape
     check_rows(tracks, 0, len(P))
@@ -291,7 +291,7 @@ def innovations(
 def predict(
     F: FloatArray, P: FloatArray, Q: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return covariances F P F' + Q, written over Q, and cross-covariances F P, shapes (m, n, n)."""
+    """Return the covariances F P F' + Q, written over Q, and the cross-covariances F P, shapes (m, n, n)."""
     check(F.shape == P.shape and Q.shape == P.shape)
     cross = np.empty(P.shape)
     for i in range(len(P)):
@@ -308,7 +308,7 @@ def propagate(
     steps: IntArray,
     dt_s: float,
 ) -> None:
-    """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`, to f(x) and F P F' + Q."""
+    """Move states (m, n) and (m, n, n) to f(x) and F P F' + Q, in `steps` (m,) steps of `dt_s` for each state."""
     n = mean.shape[1]
     check(
         len(P) >= len(mean)
@@ -345,8 +345,9 @@ def correct(
 ) -> None:
     """Fuse innovations y (m, k) into means (m, n) and covariances (m, n, n), see `correct_state`.
 
-    Jacobians H are (1, k, n) or (m, k, n), covariances R (m, k, k). Writes S = H P H' + R, the NIS of the `rows` of
-    y, and the weight under the loss, which is NaN if the innovation was not fused.
+    Jacobians H are (1, k, n) or (m, k, n), covariances R (m, k, k). Writes S = H P H' + R, the NIS of the components
+    `rows` of y, and the weight under the loss. NIS and weight are NaN if the innovation was not fused. `loss` and
+    `width` are the kind and the width of the robust loss.
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
     check_rows(rows, 0, k)

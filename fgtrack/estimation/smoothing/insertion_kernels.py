@@ -84,7 +84,9 @@ def windows(
     """Write the windows of `tracks` to `out`, shape (4, m), and return the largest number of nodes of a track.
 
     The rows are the newest stamps, the starts of the windows, the oldest stamps that can be fused, and the indices of
-    the nodes where the windows will begin. Nodes that no fusible stamp needs are forgotten.
+    the nodes where the windows will begin. A window has the length `lag_ns` before the newest stamp, or before
+    `clock_ns`. Stamps within `behind_ns` before a window can still be fused. Nodes that no such stamp needs are
+    forgotten.
     """
     info, all_ns, _, _, _, _, _, _ = nodes
     most = 0

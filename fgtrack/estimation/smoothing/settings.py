@@ -81,10 +81,11 @@ class SmootherSettings:
         return cls(lag_s=lag_s, **{"lagged_s": (), "final": False, **options})
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
-        """Return the relinearisation thresholds of the state of `motion`, shape (n,).
+        """Return the threshold of each state entry for a relinearisation, shape (n,).
 
-        Motion models are linear in the position. If a measurement is `nonlinear`, or has a robust loss, the
-        position has a threshold, too. If everything is linear, no entry has a threshold.
+        An entry without a threshold is never relinearised; its value is 1e9. `nonlinear` is True if a measurement is
+        nonlinear or has a robust loss. Motion models are linear in the position, so the position has a threshold only
+        then. If everything is linear, no entry has a threshold.
         """
         named = (
             {**_NONLINEAR, **self.relinearise}

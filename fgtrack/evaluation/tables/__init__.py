@@ -34,7 +34,12 @@ _LATEX = str.maketrans(
 
 
 def short(value: Value, digits: int = 3, most_decimals: int = 3) -> str:
-    """Return `value` with three significant digits, integers and text in full; a dash for NaN."""
+    """Return `value` as text.
+
+    A float has `digits` significant digits and at most `most_decimals` decimals; digits
+    before the point are never rounded away. NaN and infinity become a dash. Integers and
+    text are unchanged.
+    """
     if not isinstance(value, float):
         return str(value)
     if not math.isfinite(value):
@@ -46,7 +51,7 @@ def short(value: Value, digits: int = 3, most_decimals: int = 3) -> str:
 
 
 def two_digits(value: Value) -> str:
-    """Return `value` with two significant digits and at most five decimals, integers in full; a dash for NaN."""
+    """Return `value` as text with two significant digits and at most five decimals, see `short`."""
     text = short(value, 2, 5)
     return "0" if text == "0.00000" else text
 
@@ -78,10 +83,10 @@ class Column:
     is_extra: bool = False
     """True if the column is shown only in the full table."""
     bold: Callable[[Record], bool] = _no
-    """Function that is True for records with a bold cell."""
+    """Function that returns True for records whose cell is bold."""
 
     def cell(self, record: Record) -> str:
-        """Return the text of the numbers of `record`; a dash without any number."""
+        """Return the text of the numbers of `record`; a dash if it has none of the numbers."""
         names = self.names or self.heading
         values = [
             record.get(name)

@@ -69,7 +69,11 @@ class SweepTable:
 
     @property
     def shown_axes(self) -> list[str]:
-        """Axes that vary and distinguish the points; axes with whole mappings only if needed."""
+        """Axes that vary and distinguish the points.
+
+        Axes whose values are mappings or lists are included only if the other axes do not
+        distinguish the points.
+        """
         return distinguishing(
             self.rows[[axis for axis in self.axes if self.rows[axis].nunique() > 1]]
         )
@@ -141,7 +145,11 @@ def read_sweep(folder: Path | str) -> SweepTable:
 
 
 def distinguishing(points: DataFrame) -> list[str]:
-    """Return the columns that distinguish `points`; columns with whole mappings only if needed."""
+    """Return the columns that distinguish `points`.
+
+    Columns whose cells are mappings or lists are included only if the other columns do
+    not distinguish the points.
+    """
     distinct = points.drop_duplicates()
     plain = [
         axis for axis in points if not distinct[axis].str.startswith(("{", "[")).any()
@@ -192,9 +200,9 @@ def _ranked(
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
-    """Return a row for every comparison and estimator.
+    """Return a table with a row for each comparison and estimator.
 
-    Only rows of the first metric, over several seeds, are shown.
+    Only the rows of the first metric over several seeds are shown.
     """
     records = [
         {

@@ -35,7 +35,7 @@ _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to 
 
 
 def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
-    """Return the distances of the paired rows from the truth, by way of evaluation.
+    """Return the distances of the paired rows from the truth, for each way of evaluation.
 
     Only rows with truth when they were ready count. Predictions move the published
     position along the published yaw with the published speed, if both exist.
@@ -63,7 +63,11 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
 def streaming_tables(
     runs: Sequence[EvaluatedRun],
 ) -> tuple[dict[str, Table], list[str]]:
-    """Return the tables `streaming` and `load`, and sentences on the best runs with a load of at most 1."""
+    """Return the tables `streaming` and `load`, and sentences on the best runs.
+
+    The load is the computing time over the length of the run. Runs with a load above 1
+    are not ranked.
+    """
     load = _load(runs)
     records = []
     sentences = []

@@ -32,7 +32,10 @@ class _Number(NamedTuple):
     lsb: float
 
     def read(self, item: bytes, record: Record) -> None:
-        """Add the number to `record`, unless the item, whose length varies, ends before it."""
+        """Add the number to `record`.
+
+        The length of an item varies. An item that ends before the number adds nothing.
+        """
         beyond = 8 * len(item) - self.end
         if beyond >= 0:
             value = int.from_bytes(item, "big") >> beyond & (1 << self.size) - 1

@@ -52,7 +52,7 @@ _RANGE_RATE = "range_rate_mps"
 
 
 class FieldError(Exception):
-    """A path leads to no valid value; the reader of the recording adds the position."""
+    """A path leads to no valid value. The reader of the recording adds its position."""
 
 
 def mapped(
@@ -157,7 +157,7 @@ def objects_by_fields(
     fields: Mapping[str, FieldPath],
     plane: LocalPlane | None = None,
 ) -> ObjectList:
-    """Object list of `message`; without `objects` in `fields`, the message itself is the only object."""
+    """Return the object list of `message`. If `fields` lacks `objects`, the message itself is the only object."""
     objects = []
     plane = plane or LocalPlane()
     for item in items_by_fields(message, fields):
@@ -174,7 +174,7 @@ def objects_by_fields(
 def items_by_fields(
     message: RosMessage, fields: Mapping[str, FieldPath]
 ) -> list[RosMessage]:
-    """Recorded objects of `message`, in the order of `objects_by_fields`.
+    """Return the recorded objects of `message`, in the order of `objects_by_fields`.
 
     The path of the objects may lead through lists; then the objects of all their items
     are returned.
@@ -184,7 +184,7 @@ def items_by_fields(
     path = single_path(fields["objects"])
     items = _items_at(message, path.split("."))
     if items is None:
-        raise FieldError(f"{path}: is not a list of objects")
+        raise FieldError(f"{path}: is not a list of objects, give the path of a list")
     return items
 
 

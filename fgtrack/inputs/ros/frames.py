@@ -86,7 +86,11 @@ class Edge:
         )
 
     def at(self, time_ns: int) -> Pose:
-        """Return the pose at `time_ns`, interpolated; NaN before the first and after the last sample of a motion."""
+        """Return the pose at `time_ns`, interpolated.
+
+        A moving edge keeps its first and last pose for a short time beyond the samples; beyond this time the pose is
+        NaN.
+        """
         from scipy.spatial.transform import Rotation, Slerp
 
         if self.is_constant:
@@ -345,7 +349,11 @@ def moved_detection(item: Detection, pose: Pose) -> Detection:
 
 
 def _turned(item: Detection, pose: Pose) -> tuple[float, ...] | None:
-    """Covariance of the measured components with x and y turned by the yaw of `pose`; None without one."""
+    """Return the covariance of the measured components, with x and y turned by the yaw of `pose`.
+
+    None if the detection has no covariance. A covariance of another size is returned
+    unchanged.
+    """
     size = len(item.measured)
     if item.covariance is None or len(item.covariance) != size**2:
         return item.covariance

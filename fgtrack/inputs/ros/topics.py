@@ -125,7 +125,10 @@ def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
         return native
     if not roles:
         if bag.break_off:
-            raise TruncatedInput(f"{bag.break_off}, and contains no topic of fgtrack")
+            raise TruncatedInput(
+                f"{bag.break_off}, and contains no topic of fgtrack: name its topics in the configuration "
+                "(input.ego, input.detections)"
+            )
         raise DataError(
             f"{bag.path}: is no recording of fgtrack: name its topics in the configuration "
             f"(input.ego, input.detections); it has {_listed(bag)}"

@@ -171,7 +171,9 @@ class Sheet:
     """Canvas of a figure: a new figure, or the axes that the caller gave."""
 
     def __init__(self, width_in: float, height_in: float, paper: Paper) -> None:
-        """Create a figure of this default size, scaled to the width in `paper`."""
+        """Create a figure of this size, scaled to the width in `paper`. With `ax` in `paper`, use the figure of the
+        axes.
+        """
         self._ax = paper.get("ax")
         self.has_title = self._ax is None and "width" not in paper
         if self._ax is None:

@@ -62,15 +62,17 @@ class Planned:
 
     name: str
     draw: Callable[..., Figure]
-    """Function that draws it; it takes the keyword arguments of `Paper`."""
+    """Function that draws the figure; it takes the keyword arguments of `Paper`."""
     is_extra: bool = False
-    """True if it is one of many figures of its kind, which is drawn only on request."""
+    """True for a figure that is drawn only on request, because there are many figures of its kind."""
 
 
 def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
-    """Return every figure that `runs` have data for.
+    """Return all figures that `runs` have data for.
 
-    With many objects or runs, only the figures of the worst ones are no extras.
+    With many objects or runs, only some figures of each kind are drawn by default, the
+    others are extras. These are the figures of the runs and objects with the largest
+    errors. Of the figures of arrivals they are the first ones.
     """
     extra = (
         {one.label for one in sorted(runs, key=_rmse_m)[:-_SHOWN]}
@@ -119,7 +121,7 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
 def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
     """Position RMSE of a run over one object, or over all objects.
 
-    Infinity if nothing is tracked, -1 without truth.
+    Infinity if no object is tracked, -1 without truth.
     """
     truth = one.metrics.truth
     if truth is None or (object_id is not None and object_id not in truth.objects):

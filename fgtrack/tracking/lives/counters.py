@@ -34,7 +34,7 @@ class Scan(NamedTuple):
     stamp_ns: int
     present_ns: int
     ego: EgoPose | None = None
-    """At `stamp_ns`; None where it is not known."""
+    """Pose of the ego at `stamp_ns`; None if it is unknown."""
     objects: Sequence[Detection] = ()
     """All detections of the message."""
 
@@ -63,16 +63,16 @@ class Life:
     """Counters of one track."""
 
     counter: int
-    """After all matches and misses so far, in order of their stamps."""
+    """Status counter after all matches and misses so far, in order of their stamps."""
     last_seen_ns: int
     num_placed: int
-    """Measurements of its position that have changed its state, the first one included."""
+    """Number of measurements of the position that have changed the state, the first measurement included."""
     misses: int
-    """Misses since the last match."""
+    """Number of misses since the last match."""
     settled: int
     """Counter after the matches and misses that no late list can precede."""
     num_changes: int
-    """Number of the other matches and misses."""
+    """Number of the matches and misses that a late list can still precede."""
 
 
 @settings
@@ -148,7 +148,7 @@ class CountingLifecycle(Stateful):
         }
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
-        """A detection started a track."""
+        """Start the counters of a track that a detection has started."""
         num_tracks, num_changes, _ = self._arrays[1].shape
         if self._rows.following >= num_tracks:
             self._allocate(2 * num_tracks or FEWEST, num_changes)
@@ -179,7 +179,7 @@ class CountingLifecycle(Stateful):
         pairs: Sequence[tuple[int, int]],
         states: StatesAt,
     ) -> None:
-        """Candidates were associated with tracks, which had these `states` at the stamp."""
+        """Count the matches of candidates and tracks. `states` are the states of the tracks at the stamp."""
         placed, track_ids = candidates.placed, states.track_ids
         rows = self._rows.of([track_ids[track] for i, track in pairs if placed[i]])
         increment = self._sensors[scan.sensor].counter_add
@@ -194,7 +194,7 @@ class CountingLifecycle(Stateful):
             self._allocate(num_tracks, 2 * num_changes)
 
     def fused(self, track_ids: Sequence[int]) -> None:
-        """The associated detections, which give positions, changed the states."""
+        """Count detections with positions that have changed the states of `track_ids`."""
         kernels(_KERNELS).place(self._rows.of(track_ids), self._arrays[0])
 
     def missed(
@@ -204,7 +204,11 @@ class CountingLifecycle(Stateful):
         positions_m: FloatArray,
         ranges_m: FloatArray,
     ) -> list[int]:
-        """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
+        """Count the misses of a list. Return the ids of the tracks that end.
+
+        `positions_m` (n, 2) and `ranges_m` (n,) are the positions of the missed tracks and their distances from the
+        ego.
+        """
         rows, ages = self._rows.of(track_ids), self._ages(scan.sensor, ranges_m)
         views = self._views.of(positions_m, scan.ego)
         self._count(kernels(_KERNELS).miss, rows, ages, views, scan.stamp_ns)
@@ -233,10 +237,10 @@ class CountingLifecycle(Stateful):
         watermarks_ns: IntArray | None = None,
         processed_ns: int = FOREVER,
     ) -> list[int]:
-        """The ids of tracks that end because time has passed, or lists should have come.
+        """Return the ids of the tracks that end because time has passed, or because lists should have come.
 
-        `watermarks_ns` are those of the sensors, shape (sensors,); None if they are as before. All lists with stamps
-        before `processed_ns` that have come are processed.
+        `watermarks_ns` are the watermarks of the sensors, shape (sensors,); None if they are as before. All received
+        lists with stamps before `processed_ns` have been processed.
         """
         if watermarks_ns is not None:
             self._watermarks_ns = watermarks_ns
@@ -264,17 +268,22 @@ class CountingLifecycle(Stateful):
         return frozenset()
 
     def forget(self, track_id: int) -> None:
-        """The track has ended, or could not begin."""
+        """Forget a track that has ended, or that could not begin."""
         self._rows.end(track_id)
 
     def existing(self, track_ids: Sequence[int], stamp_ns: int) -> FloatArray:
-        """Probabilities that the objects of tracks exist at a stamp, shape (m,); 1 / 2, as counts give none."""
+        """Return the probabilities that the objects of tracks exist at a stamp, shape (m,). They are always 1 / 2,
+        because counts give no probability.
+        """
         return np.full(len(track_ids), 0.5)
 
     def reported(
         self, track_ids: Sequence[int]
     ) -> tuple[list[TrackStatus], Sequence[float | None]]:
-        """Return the statuses of tracks, and the probabilities that their objects exist: None, as counts give none."""
+        """Return the statuses of tracks, and the probabilities that their objects exist.
+
+        The probabilities are None, because counts give no probability.
+        """
         codes = kernels(_KERNELS).report(
             self._rows.of(track_ids), self._rules.confirm_count, self._arrays[0]
         )

@@ -53,10 +53,10 @@ _KERNELS = "fgtrack.tracking.lives.existence_kernels"
 
 
 class _Matches(NamedTuple):
-    """Detections of a list with the tracks that they matched, m."""
+    """Matches of m detections of a list and tracks."""
 
     rows: IntArray
-    """Of the tracks, see `ExistenceLifecycle`, shape (m,)."""
+    """Rows of the tracks in the arrays of `ExistenceLifecycle`, shape (m,)."""
     stamp_ns: int
     sensor: int
     scores: FloatArray
@@ -313,8 +313,10 @@ class ExistenceLifecycle(Stateful):
     def likely(
         self, name: str, stamp_ns: int, track_ids: Sequence[int], pairs: Pairs
     ) -> BoolArray:
-        """True of `pairs` of positions of a list and tracks that exist rather than of clutter or new objects, (m,).
-        That is P_D r N(y; 0, S) > (1 - P_D r) clutter / (1 - birth probability), each pair by itself.
+        """Return True for each of `pairs` that is likelier a track than clutter or a new object, shape (m,).
+
+        The pairs are pairs of positions of a list and tracks. The test is P_D r N(y; 0, S) > (1 - P_D r) clutter / (1 -
+        birth probability), for each pair by itself. Sensors without `scan` have 1 instead of 1 - P_D r.
         """
         sensor, rules = self._sensors[name], self._rules
 
@@ -406,7 +408,7 @@ class ExistenceLifecycle(Stateful):
         return np.array([self._score(scan, each) for each in every])
 
     def _score(self, scan: Scan, indices: Iterable[int]) -> float:
-        """Logarithm of p(score | object) / p(score | clutter) of the best of some detections; 0 where there is none."""
+        """Return the logarithm of p(score | object) / p(score | clutter) for the best detection; 0 without a score."""
         model = self._sensors[scan.sensor].score
         if model is None or not scan.objects:
             return 0.0
@@ -479,10 +481,10 @@ def explained(
     others_per_m2: float,
     more_nis: FloatArray,
 ) -> BoolArray:
-    """True of `pairs` of positions and tracks that are at least as likely as clutter or a new object, shape (m,).
+    """Return True for each pair of a position and a track that is at least as likely as clutter or a new object, (m,).
 
-    That is odds N(y; 0, S) exp(-more_nis / 2) >= others_per_m2. The `odds` (m,) are those that the list shows the
-    object of the track, `others_per_m2` is the density of clutter and new objects, and `more_nis` (m,) the evidence of
+    The test is odds N(y; 0, S) exp(-more_nis / 2) >= others_per_m2. `odds` (m,) are the odds that the list shows the
+    object of the track. `others_per_m2` is the density of clutter and new objects. `more_nis` (m,) is the evidence of
     identities. A pair without a density stays.
     """
     rows, columns, _ = pairs

@@ -97,7 +97,9 @@ class Delays(Stateful):
     def add(
         self, stamp_ns: int, receipt_ns: int, newest_stamp_ns: int | None = None
     ) -> None:
-        """Learn from a message; `stamp_ns` is its oldest stamp, where its detections have several."""
+        """Learn the delay of a message. `stamp_ns` and `newest_stamp_ns` are the oldest and newest stamps of its
+        detections.
+        """
         self.messages += 1
         stamp_ns, receipt_ns = (
             int(stamp_ns),
@@ -120,7 +122,7 @@ class Delays(Stateful):
             self._newest_stamp_ns = newest_ns
 
     def processed(self, stamp_ns: int) -> None:
-        """A list with this stamp is processed."""
+        """Note that a list with this stamp has been processed."""
         self._processed_ns = max(self._processed_ns, stamp_ns)
 
     def usual_ns(self, most_ns: int = FOREVER) -> int:
@@ -162,7 +164,7 @@ class Watermarks(Stateful):
     def __init__(
         self, sensors: Mapping[str, SensorModel], sources: Iterable[str] = ()
     ) -> None:
-        """`sources` are names of others, as the ego, whose delays are learned too."""
+        """`sources` are the names of further sources, for example the ego, whose delays are learned too."""
         self.delays = {name: Delays() for name in (*sensors, *sources)}
         """Delays by name of the source."""
         self._of_sensors = [self.delays[name] for name in sensors]
@@ -193,7 +195,7 @@ class Watermarks(Stateful):
 
 
 class Views:
-    """Sensors that could show an object: those that give positions, where the object is in their view."""
+    """Test for the sensors that could show an object: they give positions, and the object is in their field of view."""
 
     def __init__(
         self,
@@ -212,8 +214,10 @@ class Views:
         ]
 
     def of(self, positions_m: FloatArray, ego: EgoPose | None) -> BoolArray:
-        """True of each sensor that could show an object at `positions_m` (m, 2), shape (m, sensors).
-        Without an `ego` all objects are in view.
+        """Return, for objects at `positions_m` (m, 2), True for each sensor that could show the object, shape (m,
+        sensors).
+
+        `ego` is the pose of the ego in the map. Without a pose, all objects are in view.
         """
         views = np.tile(self._placing, (len(positions_m), 1))
         if ego is not None and self._limited:
@@ -227,7 +231,11 @@ class Views:
     def at_birth(
         self, position_m: FloatArray | None, ego: EgoPose | None, sensor: int
     ) -> BoolArray:
-        """True of each sensor that could show an object that `sensor` (its index) has just shown, shape (sensors,)."""
+        """Return True for each sensor that could show a new object, shape (sensors,).
+
+        `sensor` is the index of the sensor that has just shown the object; its entry is True. Without a position, the
+        object is in view of all sensors that give positions.
+        """
         views = (
             self._placing.copy()
             if position_m is None

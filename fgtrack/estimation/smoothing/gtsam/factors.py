@@ -208,18 +208,21 @@ class _Innovation(NamedTuple):
     """Innovation of a measurement, and the derivatives of the predicted measurement."""
 
     y: FloatArray
-    """Measured minus predicted, shape (k,)."""
+    """Measured minus predicted values, shape (k,)."""
     by_state: FloatArray
-    """Shape (k, n)."""
+    """Derivative by the state, shape (k, n)."""
     by_sensor: FloatArray
-    """By x, y and yaw of the sensor in the map, shape (k, 3)."""
+    """Derivative by x, y and yaw of the sensor in the map, shape (k, 3)."""
     by_offset: FloatArray
-    """By the clock offset, shape (k,)."""
+    """Derivative by the clock offset, shape (k,)."""
 
 
 @dataclass(frozen=True)
 class _View:
-    """A measurement as a function of the state, the pose of the sensor and its clock offset."""
+    """A measurement as a function of the state, the sensor pose and the clock offset.
+
+    `ahead_s` is the time from the state to the stamp of the measurement. Without `motion` the state does not move.
+    """
 
     measurement: Measurement
     motion: MotionModel | None
@@ -282,9 +285,10 @@ class _View:
 def _sensor(
     variable: gtsam.Pose2, ego: gtsam.Pose2 | None, mount: gtsam.Pose2 | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the sensor pose in the map, ego * variable * mount, as (x, y, yaw), and its derivative, shape (3, 3).
+    """Return the sensor pose in the map as (x, y, yaw), and its derivative, shape (3, 3).
 
-    The derivative is by the tangent vector of gtsam, in the axes of the variable.
+    The pose is ego * variable * mount. `variable` is the unknown part. `ego` and `mount` are known parts; None leaves a
+    part out. The derivative is by the tangent vector of gtsam, in the axes of the variable.
     """
     left = variable if ego is None else ego.compose(variable)
     sensor = left if mount is None else left.compose(mount)
