@@ -83,7 +83,7 @@ class Evidence:
         return any((item.kind, item.about) == (kind, about) for item in self.findings)
 
     def doubt(self, about: str) -> str | None:
-        """Subject of a finding that makes results of the run doubtful for `about`; None without one."""
+        """Subject of a finding that makes results of the run doubtful for `about`; None if there is no such finding."""
         subjects = [about, *([EGO] if about in self.moving or about == TRACKS else [])]
         if about == TRACKS:
             subjects += [*self.sensors, "recording"]

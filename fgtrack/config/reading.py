@@ -57,7 +57,7 @@ def read_scenario(
     """Return a scenario: a `Scenario`, a mapping with the keys of a scenario file, or a file.
 
     A file is searched in `folder`, else among the shipped names. `duration_s` replaces the
-    duration. Raises as `read_config`.
+    duration. Raises the exceptions of `read_config`.
     """
     from fgtrack.sim.scenario import Scenario
 

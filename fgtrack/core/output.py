@@ -117,7 +117,7 @@ def new_path(
 ) -> Iterator[Path]:
     """Temporary path for a file or folder that is renamed to `path` when the block ends.
 
-    Raises as `check_output` and `write_error`.
+    Raises the exceptions of `check_output` and `write_error`.
     """
     check_output(path, overwrite, replaceable, what)
     with _part_of(path) as part:
@@ -134,7 +134,7 @@ def new_path(
 def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
     """Temporary folder whose files are moved into `folder` when the block ends.
 
-    Raises as `new_path`. Without `overwrite`, an existing file may only be replaced by
+    Raises the exceptions of `new_path`. Without `overwrite`, an existing file may only be replaced by
     equal content.
     """
     check_output(folder, True, os.path.isdir, "a folder")

@@ -144,7 +144,7 @@ def drafted(recording: Path | str, config: Config | None = None) -> Draft:
     """Return all settings of a recording: given ones stay, tests decide the others, and the rest is assumed.
 
     The steps are those of `opened`, and assumptions about noise, coverage and clutter
-    from the detections. Raises as `opened`.
+    from the detections. Raises the exceptions of `opened`.
     """
     draft = opened(recording, config)
     return draft.with_assumed(assumed(draft.config, draft.source))
@@ -157,7 +157,7 @@ def opened(recording: Path | str, config: Config | None = None) -> Draft:
     Then tests decide (`fgtrack.meaning.evidence`). A recording whose sensors have a
     mapping and noise is opened as given.
 
-    Raises as `open_input`.
+    Raises the exceptions of `open_input`.
     """
     check_paths(recording=recording)
     path = Path(recording)
@@ -192,7 +192,7 @@ def opened_together(
 ) -> tuple[dict[str, InputSource], Config]:
     """Open several recordings of one vehicle by name; the first one decides the settings for all.
 
-    Returns the sources by path, and the settings. Raises as `open_input`.
+    Returns the sources by path, and the settings. Raises the exceptions of `open_input`.
     """
     sources: dict[str, InputSource] = {}
     for path in recordings:

@@ -49,10 +49,10 @@ def yaw_meaning(
     paths: Sequence[StraightPath],
     conventions: Sequence[Convention] = ("counter-clockwise from x",),
 ) -> YawMeaning | None:
-    """Return the meaning of the orientations in `scans`, whose raw values are angles in rad; None without any.
+    """Return the meaning of the orientations in `scans`, whose raw values are angles in rad.
 
-    `paths` are the straight paths of the objects. `conventions` are tested in their
-    order.
+    None if no orientation is finite. `paths` are the straight paths of the objects.
+    `conventions` are tested in their order.
     """
     values = np.concatenate([each[:, 0] for each in scans.values] or [np.zeros(0)])
     values = values[np.isfinite(values)]

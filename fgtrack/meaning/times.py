@@ -109,7 +109,7 @@ class Loop:
 def time_columns(
     columns: Mapping[str, FloatArray], words: Mapping[str, Sequence[str]]
 ) -> TimeColumns | None:
-    """Return the columns of stamp and receipt among `columns`, which contain times, shape (n,); None without any.
+    """Return the columns of stamp and receipt among `columns`, each of shape (n,); None if no column contains times.
 
     `words` contains the words of each name. A column of nanoseconds below 1e9 belongs to
     the seconds with the same beginning of the name. Of two clocks, the receipt is the
@@ -219,10 +219,11 @@ def clock_constant(delays_s: FloatArray) -> ClockConstant | None:
 
 
 def loop_of(stamps_ns: IntArray, receipts_ns: IntArray) -> Loop | None:
-    """Return the first repetition of the stamps of one source, shape (n,), in the order of receipt; None without one.
+    """Return the first repetition of the stamps of one source, shape (n,), in the order of receipt.
 
-    A repetition goes back by most of the time that was recorded before, and the stamps
-    continue from there. Single wrong stamps are no repetition.
+    None if there is no repetition. A repetition goes back by most of the time that was
+    recorded before, and the stamps continue from there. Single wrong stamps are no
+    repetition.
     """
     if len(stamps_ns) < 4:
         return None

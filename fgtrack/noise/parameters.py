@@ -20,7 +20,9 @@ _DIGITS = 4
 
 @dataclass(frozen=True)
 class ConfigNoise:
-    """Noise parameters of a configuration: process noise, and the standard deviations of each sensor."""
+    """Noise parameters of a configuration: process noise, standard deviations of each sensor, and shares of
+    outliers.
+    """
 
     config: Config
 

@@ -296,7 +296,10 @@ class _Tuning:
         )
 
     def _best_start(self, problem: Problem) -> FloatArray:
-        """Return the best of three start vectors: the one that reaches the highest maximum on a part of the data."""
+        """Return the best of three start vectors: the one that reaches the highest maximum on a part of the data.
+
+        Returns the configured values if the part is too small for a comparison.
+        """
         self._on_step("starts")
         longest = sorted(problem.series, key=lambda item: -len(item.observations))[
             :_START_TRACKS

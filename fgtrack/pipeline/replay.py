@@ -124,7 +124,7 @@ def replay_in_memory(
 ) -> Run:
     """Return the run that `replay` would write, without writing files; `observed` as in `build_tracker`.
 
-    Raises as `replay`.
+    Raises the exceptions of `replay`.
     """
     repeated = repeatable(messages, config)
     config = assumed(config, source_of(repeated)).config

@@ -33,7 +33,7 @@ class Pairs(NamedTuple):
     """Distance or cost, shape (m,)."""
 
     def at(self, chosen: BoolArray | IntArray) -> "Pairs":
-        """Return the `chosen` ones."""
+        """Return the pairs with the indices or the mask `chosen`."""
         return Pairs(self.rows[chosen], self.columns[chosen], self.values[chosen])
 
 
@@ -45,7 +45,7 @@ class Assignment(NamedTuple):
     """Outcome of an association."""
 
     pairs: list[tuple[int, int]]
-    """(candidate, track) as indices into the associated lists, candidates ascending."""
+    """Pairs (candidate, track) as indices into the associated candidates and tracks, candidates ascending."""
     new: list[int]
     """Candidates without a track, in the order of their birth."""
     missed: list[int]
@@ -53,7 +53,7 @@ class Assignment(NamedTuple):
     refused: tuple[int, ...] = ()
     """Candidates that neither belong to a track nor may start one."""
     readings: tuple[Readings, ...] = ()
-    """Readings of the pairs that were compared, where a detection may be read in several ways."""
+    """Readings of the pairs that were compared, for groups whose detections may be read in several ways."""
 
 
 class AssociationProblem(NamedTuple):
@@ -66,7 +66,9 @@ class AssociationProblem(NamedTuple):
     likely: Likely | None = None
     """Selects pairs by their costs NIS + log det S; an association by distance ignores it."""
     facings: Facings | None = None
-    """Readings of yaws that may be half a turn off; None if every yaw is taken as measured."""
+    """Log-odds of the fronts and shares of wrong yaws, by which yaws are read; None if every yaw is used as
+    measured.
+    """
 
 
 class Association(ABC):
@@ -112,7 +114,7 @@ class GatedEuclidean(Association):
 
     @property
     def reads_yaws(self) -> bool:
-        """See `Association`; without `max_nis` every pair inside the gate is fused as it is."""
+        """See `Association`. Without `max_nis` every pair inside the gate is fused as it was measured."""
         return self.max_nis is not None
 
     def assign(self, problem: AssociationProblem) -> Assignment:
@@ -128,7 +130,9 @@ class GatedEuclidean(Association):
         apart: Apart | None = None,
         facings: Facings | None = None,
     ) -> Assignment:
-        """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
+        """Return the assignment with the gates `gates_m` instead of `gate_m`. They broadcast to (candidates,
+        tracks).
+        """
         is_one = isinstance(gates_m, float)
         pairs = near(
             candidates,
@@ -198,7 +202,10 @@ class GatedMahalanobis(Association):
         apart: Apart | None = None,
         facings: Facings | None = None,
     ) -> Pairs:
-        """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
+        """Return the pairs inside the gate with their cost NIS + log det S.
+
+        The determinant prevents that a track with a large covariance has the least cost.
+        """
         return self._gated(candidates, states, apart, facings)[0]
 
     def _gated(
@@ -246,7 +253,7 @@ def claimed(
     claims_m: float | FloatArray,
     apart: Apart | None,
 ) -> Assignment:
-    """Return `assignment` in which candidates at most `claims_m`, see `near`, from a track start none."""
+    """Return `assignment` in which a candidate at most `claims_m` from a track starts no track; see `near`."""
     rows = (
         near(candidates, states.means, claims_m, apart).rows
         if assignment.new
@@ -256,7 +263,7 @@ def claimed(
 
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
-    """Return `assignment` in which `suspects` without a track start no track."""
+    """Return `assignment` in which candidates of `suspects` without a track start no track."""
     if suspects.isdisjoint(assignment.new):
         return assignment
     refused = tuple([i for i in assignment.new if i in suspects])
@@ -275,7 +282,7 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 @cache
 def _quantiles(probability: float, most: int) -> FloatArray:
-    """`chi_square_quantile` of 0 to `most` degrees of freedom, shape (most + 1,)."""
+    """Return `chi_square_quantile` for 0 to `most` degrees of freedom, shape (most + 1,)."""
     return np.array(
         [
             0.0,
@@ -289,12 +296,12 @@ def _quantiles(probability: float, most: int) -> FloatArray:
 
 @cache
 def _same_limits(limit: float, most: int) -> FloatArray:
-    """One limit for any number of components up to `most`, shape (most + 1,)."""
+    """Return the same limit for 0 to `most` components, shape (most + 1,)."""
     return np.full(most + 1, limit)
 
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
-    """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
+    """Return the assignment with as many of `pairs` as possible, and with the least sum of their values."""
     i, j = pairs.rows.tolist(), pairs.columns.tolist()
     if _compete(i, j):
         pairs = pairs.at(_uncontested(pairs.rows, pairs.columns, pairs.values))
@@ -331,7 +338,10 @@ def _uncontested(i: IntArray, j: IntArray, cost: FloatArray) -> BoolArray:
 
 
 def _least_cost(pairs: Pairs) -> IntArray:
-    """Indices of the best of `pairs`: each row may take a column of its own instead, outside every gate."""
+    """Return the indices of the pairs of the assignment with the least sum of values.
+
+    Each row may stay without a column; this costs more than any pair.
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
@@ -359,9 +369,11 @@ def near(
     reach_m: float | FloatArray,
     excluded: Apart | None = None,
 ) -> Pairs:
-    """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
-    A candidate keeps its `MOST_NEAR` nearest tracks. Distances are in the map; the distance of a bearing is from the
-    track to the line of sight.
+    """Return the pairs of candidates and tracks that are at most `reach_m` apart, with their distances.
+
+    `reach_m` is a number, or a number for each track. Pairs in `excluded` are left out. A candidate keeps its
+    `MOST_NEAR` nearest tracks. Distances are in the map; the distance of a bearing is from the track to the line of
+    sight.
     """
     limits_m = np.empty(len(means))
     limits_m[:] = reach_m
@@ -377,7 +389,10 @@ def near(
 def _innovations_of(
     group: Group, members: IntArray, columns: IntArray, states: StatesAt
 ) -> tuple[FloatArray, FloatArray]:
-    """Return NIS and log det S of `members` of `group` with the tracks `columns`, all (p,); NaN where S has no root."""
+    """Return NIS and log det S of `members` of `group` with the tracks `columns`, all (p,).
+
+    Both are NaN if S is not positive definite.
+    """
     P, own = np.ascontiguousarray(states.covariances), group.stack
     x = states.means.take(columns, axis=0)
     y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
@@ -396,9 +411,11 @@ def weighed(
     limits: Callable[[int], FloatArray],
     more: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray, list[Readings]]:
-    """Return the costs NIS + log det S of `pairs` (m,), True of those inside the gate, and readings.
-    `limits` gives the largest NIS of 0 to k components, shape (k + 1,); `more` (m,) is added to the NIS. With `facings`
-    the cost is that of the likeliest reading of a yaw, see `fgtrack.tracking.facing`, and one reading has to be inside.
+    """Return the costs NIS + log det S of `pairs` (m,), a mask of the pairs inside the gate (m,), and readings.
+
+    `limits` returns the largest NIS for 0 to k components, shape (k + 1,). `more` (m,) is added to the NIS. With
+    `facings` the cost belongs to the likeliest reading of a yaw, see `fgtrack.tracking.facing`. A pair is inside if one
+    of its readings is inside.
     """
     cost, inside, readings = (
         np.empty(len(pairs.rows)),
@@ -428,10 +445,11 @@ def reaches_m(
     limit_m: float,
     more_nis: float = 0.0,
 ) -> FloatArray:
-    """Largest distance from each track of a candidate with a NIS up to the quantile of `probability` and `more_nis`.
-    Shape (tracks,).
-    The NIS is at least that of the position alone, which is at least the squared distance over the largest variance of
-    S = P + R in any direction. At most `limit_m`, and just that where it is not the position that is measured.
+    """Return the largest distance from each track at which a candidate can lie inside the gate, shape (tracks,).
+
+    Inside the gate the NIS is at most the quantile of `probability` plus `more_nis`. The NIS is at least the NIS of the
+    position alone, which is at least the squared distance over the largest variance of S = P + R in any direction. The
+    distance is at most `limit_m`. It is `limit_m` if the position is not measured.
     """
     squared_m2 = np.zeros(len(states.means))
     for group in groups:
@@ -457,7 +475,7 @@ def reaches_m(
 
 
 def _largest_variances(covariances: FloatArray) -> FloatArray:
-    """Larger eigenvalues, shape (m,), of the position blocks of (m, n, n)."""
+    """Return the larger eigenvalues of the position blocks of covariances (m, n, n), shape (m,)."""
     blocks = symmetrise(covariances[:, :2, :2])
     middle, half = (
         0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1]),

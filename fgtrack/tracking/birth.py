@@ -51,8 +51,10 @@ class Birth:
     def prior(
         self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool
     ) -> Start | None:
-        """First state at the candidate's stamp; None where it has no position to start from.
-        Measured components come first, then map heading, road curvature and a share of the ego speed.
+        """Return the first state of a track at the stamp of `candidate`; None if the candidate gives no position.
+
+        Measured components have priority. Map heading, road curvature and a share of the ego speed replace missing
+        components.
         """
         if candidate.position_m is None:
             return None
@@ -133,12 +135,14 @@ def in_any_direction(
     starts: Mapping[int, Start],
     directed: Mapping[int, tuple[Start, int]] | None = None,
 ) -> StatesAt:
-    """Return `states` at `stamp_ns` with the positions of the tracks of `starts` as uncertain in any direction.
-    A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
-    Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
+    """Return `states` at `stamp_ns`, with equal position variances in all directions for the tracks of `starts`.
 
-    `directed` are tracks with a second position, and its stamp. Before that stamp the state of a filter follows from
-    the first position alone: it spreads by at least half of speed_std dt along the yaw. A smoother has used both.
+    A state with an unknown yaw is linearised along an assumed yaw, so its predicted position spreads only along this
+    yaw. Until a second position gives the direction, the position gets the same variance (speed_std dt)^2 across.
+
+    `directed` are the starts of tracks with a second position, and the stamp of this position. Before this stamp the
+    state of a filter follows from the first position alone: it spreads by at least half of speed_std dt along the yaw.
+    A smoother has used both positions.
     """
     covariances = states.covariances.copy()
     for row, track_id in enumerate(states.track_ids):

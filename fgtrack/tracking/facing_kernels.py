@@ -43,8 +43,9 @@ _LOG_TURN = math.log(2.0 * math.pi)
 
 @inlined
 def _forwards(speed_mps: float, variance: float) -> float:
-    """Return the log-likelihood of the speed if the yaw points forwards, minus the one if the yaw points backwards.
-    With f = P(speed > 0) that is log (f (1 - b) + (1 - f) b) / (f b + (1 - f) (1 - b)), b = `BACKWARDS`.
+    """Return the log-likelihood ratio of the speed: the yaw points forwards, against the yaw points backwards.
+
+    With f = P(speed > 0) it is log (f (1 - b) + (1 - f) b) / (f b + (1 - f) (1 - b)), b = `BACKWARDS`.
     """
     f = 0.5 * math.erfc(-speed_mps / math.sqrt(2.0 * (variance + SLOW_MPS * SLOW_MPS)))
     front = f * (1.0 - BACKWARDS) + (1.0 - f) * BACKWARDS
@@ -53,9 +54,11 @@ def _forwards(speed_mps: float, variance: float) -> float:
 
 @inlined
 def _weigh(shares: FloatArray, is_signed: bool, weights: FloatArray) -> None:
-    """Write the weights of readings of a yaw where it is that of the front (row 0) and of the rear (row 1).
-    Columns are the readings 0, `HALF_TURN` and `WITHOUT_YAW`, then the same `REVERSED`. A detector that takes the rear
-    for the front may report the speed along what it takes for the front, or along the front.
+    """Write the weights of the readings of a yaw, if the yaw of the state is that of the front (row 0) or rear (row
+    1).
+
+    The columns are the readings 0, `HALF_TURN` and `WITHOUT_YAW`, then the same readings with `REVERSED`. A detector
+    that takes the rear for the front may report the speed along the supposed front, or along the front.
     """
     right, flip, other = shares[0], shares[1], shares[2]
     if not is_signed:
@@ -87,7 +90,9 @@ def _compare(
     signs: int,
     evidence: FloatArray,
 ) -> None:
-    """Write the log-likelihood ratio of the facing, and the probabilities that the yaw is half a turn off, or anything.
+    """Write the log-likelihood ratio of the front, and the probabilities that the yaw is half a turn off, or
+    arbitrary.
+
     `logs` are the log-likelihoods of the readings, in the columns of `weights`.
     """
     highest = -np.inf
@@ -124,8 +129,10 @@ def turned(
     before: BoolArray,
     sure: float,
 ) -> BoolArray:
-    """Return which kinematic states (m, n) and (m, n, n) have the yaw of the rear, shape (m,).
-    The belief of `log_odds` (m,) and of the speed changes what was true `before` where it is beyond `sure`.
+    """Return True for each kinematic state, (m, n) and (m, n, n), whose yaw is that of the rear, shape (m,).
+
+    The log-odds of the front are `log_odds` (m,) plus the evidence of the speed. If their magnitude is at most `sure`,
+    the value `before` (m,) stays.
     """
     m = len(means)
     check(min(len(covariances), len(log_odds), len(before)) >= m and means.shape[1] > 3)
@@ -162,13 +169,14 @@ def read(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the likeliest readings (m,), their costs (m,) and the evidence (m, 3) of pairs of detections and tracks.
 
-    Innovations y and values z (m, k), Jacobians H (m, k, n) or (1, k, n), states x (tracks, n) with covariances P,
-    R (m, k, k). `yaw` is the index of the yaw, -1 without one; `signed` (k,) are components that are opposite where
-    front and rear are exchanged. `log_odds` (tracks,) are those of the facing without the speed, `shares` (3,) those of
-    yaws that are right, half a turn off, and anything. Without `learns` there is no evidence.
+    Innovations are y and values z (m, k), Jacobians H (m, k, n) or (1, k, n), states x (tracks, n) with covariances P,
+    covariances R (m, k, k). `yaw` is the index of the yaw, -1 without a yaw. `signed` (k,) marks components that are
+    opposite if front and rear are exchanged. `log_odds` (tracks,) are the log-odds of the front without the speed.
+    `shares` (3,) are the shares of yaws that are right, half a turn off, and arbitrary. Without `learns` there is no
+    evidence.
 
-    The cost is NIS + log det S - 2 log of the weight over that of a right yaw. A pair is inside if the NIS of one
-    reading, with `more` (m,), is at most the limit of its number of components, `limits` (k + 1,).
+    The cost is NIS + log det S - 2 log of the weight over the weight of a right yaw. A pair is inside if the NIS of one
+    reading plus `more` (m,) is at most the limit for its number of components, `limits` (k + 1,).
     """
     m, k = y.shape
     check_rows(tracks, 0, min(len(x), len(P), len(log_odds)))
@@ -314,9 +322,10 @@ def learn(
     stamps_ns: IntArray,
     seen: FloatArray,
 ) -> IntArray:
-    """Add the `evidence` (m, 3) of detections with these reading `codes` (m,) to the belief about the tracks in `rows`.
-    Between two detections front and rear are exchanged with the rate `switch_hz`. With a yaw the numbers of right,
-    flipped and other yaws that were `seen` (3,) are updated. Returns the defects of the yaws (m,).
+    """Add the `evidence` (m, 3) of detections with reading `codes` (m,) to the log-odds of the tracks in `rows`.
+
+    Between two detections front and rear are exchanged with the rate `switch_hz`. With a yaw, the numbers of right,
+    flipped and other yaws in `seen` (3,) are updated. Returns the defects of the yaws (m,).
     """
     check_rows(rows, 0, min(len(log_odds), len(stamps_ns)))
     check(

@@ -29,8 +29,9 @@ X, Y, YAW, RANGE, BEARING, CURVATURE = (
 
 @inlined
 def _checked_starts(starts: IntArray, num_lists: int, num_rows: int) -> int:
-    """Return the number of rows. Raises `IndexError` unless the `starts` of lists ascend from 0 to at most `num_rows`.
-    There is no limit below 0.
+    """Return the number of rows. Raise `IndexError` unless the `starts` of lists ascend from 0 to at most `num_rows`.
+
+    A negative `num_rows` is no limit.
     """
     check(len(starts) == num_lists + 1 and starts[0] == 0)
     for k in range(num_lists):
@@ -47,10 +48,11 @@ def to_map(
     poses: FloatArray,
     moves: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return components (m, 8) and positions (m, 2) in the map of detections, NaN for none, and m times False.
-    The rows from `starts[k]` up to the next start are of list k. Of each of them `numbers` has the components
-    `columns[k]`, which end with -1. x, y and yaw are seen from the pose k (x, y, yaw ...) where it `moves` them; range
-    and bearing always are.
+    """Return the components (m, 8) and the positions (m, 2) of detections in the map, and an array of False (m,).
+
+    Missing values are NaN. List k has the rows from `starts[k]` up to the next start. `numbers` contains the components
+    `columns[k]` of each row, one row after the other; the columns end with -1. If `moves[k]`, x, y and yaw are relative
+    to the pose k (x, y, yaw ...). Range and bearing are always relative to it.
     """
     m, at, needed = _checked_starts(starts, len(poses), -1), 0, 0
     check(
@@ -103,8 +105,10 @@ def on_road(
     curvature: FloatArray,
     outside: BoolArray,
 ) -> BoolArray:
-    """Write a heading of the map that a list k `takes` and that is not measured, and a curvature; shape (lists, 2).
-    Returns which are `outside` (m,), of those with a position.
+    """Write heading and curvature of the map into the `values` of detections with a position.
+
+    `takes` (lists, 2) selects heading and curvature for each list. A measured yaw is kept. Returns `outside` (m,), but
+    False for detections without a position.
     """
     m = _checked_starts(starts, len(takes), len(values))
     check(
@@ -135,9 +139,10 @@ def described(
     starts: IntArray,
     poses: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
-    """Return which components detections have, as the bits of a number (m,), and their positions and NaN (m, 3).
-    The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction; infinity for the
-    direction where there is no bearing either.
+    """Return the measured components of detections as the bits of a number (m,), and lines (m, 3).
+
+    The highest bit is `map_yaw`. A line contains the position and NaN. For a bearing alone it contains the position of
+    the sensor, and the direction; the direction is infinity without a bearing.
     """
     m, num = values.shape
     check(
@@ -178,9 +183,11 @@ def pose_error(
     covariance: FloatArray,
     G: FloatArray,
 ) -> None:
-    """Write J P J' (5, 5) of x, y, yaw, vx, vy of the `pose` of a sensor, fixed to a body, and derivatives G (m, k, 5).
-    P is of x, y, yaw, speed and yaw rate of the body, which is at `x_m`, `y_m` (`core.geometry.body_point`). G is that
-    of detections at `points` (m, 2), placed in the map by the pose; of the `components` (k,) x, y and yaw depend on it.
+    """Write the covariance J P J' (5, 5) of a sensor `pose` (x, y, yaw, vx, vy) and the derivatives G (m, k, 5) by it.
+
+    The sensor is fixed to a body, at `x_m`, `y_m` in the body (`core.geometry.body_point`). P is the covariance of x,
+    y, yaw, speed and yaw rate of the body. G are the derivatives of detections at `points` (m, 2), which the pose has
+    placed in the map: of the `components` (k,), x, y and yaw depend on the pose.
     """
     check(
         len(pose) >= 5
@@ -229,10 +236,11 @@ def near(
     reach_m: FloatArray,
     most: int,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
-    Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction, and infinity where the
-    direction is unknown: every track has the distance 0. At most so many tracks of each point, the nearest ones. `by_x`
-    are the tracks in the order of x.
+    """Return rows, columns and distances of the pairs of points and tracks that are at most `reach_m` (n,) apart.
+
+    `points` (m, 3) are positions and NaN, or the origin of a line of sight and its direction. The direction is infinity
+    if it is unknown: all tracks then have the distance 0. Each point keeps its `most` nearest tracks. `by_x` are the
+    indices of the tracks in the order of x.
     """
     m, n = len(points), len(means)
     check(len(by_x) >= n and len(reach_m) >= n and most > 0 and points.shape[1] >= 3)
@@ -294,9 +302,10 @@ def near(
 def linked(
     points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
 ) -> tuple[IntArray, BoolArray]:
-    """First of the `points` (n, 2) that each one is linked to by steps of at most `distance` in its list, shape (n,).
-    With True for each list without links. `by_x` (n,) has the points of a list from `starts[k]` up to the next start,
-    in the order of x.
+    """Return for each of `points` (n, 2) the first point that it is linked to, shape (n,), and lists without links.
+
+    Points of a list are linked by steps of at most `distance`. The second result is True for each list without links.
+    List k has the points `by_x` (n,) from `starts[k]` up to the next start, in the order of x.
     """
     check(_checked_starts(starts, len(starts) - 1, len(points)) <= len(by_x))
     check_rows(by_x, 0, len(points))
@@ -322,7 +331,10 @@ def linked(
 
 @njit("int64[::1](float64[:, ::1], float64[:, :, ::1])")
 def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
-    """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
+    """Return the fault of each state (m, n) and (m, n, n), shape (m,).
+
+    A state may be not finite, or beyond any vehicle, or its covariance may be invalid.
+    """
     m, n = means.shape
     check(
         len(covariances) >= m

@@ -40,9 +40,10 @@ class ListUpdate:
         states: StatesAt,
         records: list[Iterable[UpdateRecord]],
     ) -> None:
-        """Fuse the matched candidates, group by group; `records` get theirs in the order of the candidates.
+        """Fuse the matched candidates, group by group. Append their records to `records`, in the order of the
+        candidates.
 
-        A group that raises has failed, and what others have fused is recorded whatever happens afterwards.
+        If a group raises, its candidates have failed. The results of the other groups are recorded in any case.
         """
         outcomes: dict[
             int, tuple[Measurement, UpdateResult]
@@ -87,7 +88,7 @@ class ListUpdate:
         assignment: Assignment,
         states: StatesAt,
     ) -> YawsRead | None:
-        """Return the readings of the matched candidates; None where every yaw is taken as it is."""
+        """Return the readings of the matched candidates; None if every yaw is used as it was measured."""
         facing = self._parts.facing
         if facing is None:
             return None
@@ -107,7 +108,7 @@ class ListUpdate:
     ) -> None:
         """Fuse a stack of measurements of the tracks whose states have the indices `of` (m,).
 
-        The outcomes of `pairs` (m,) are noted. The measurements give positions where they are `placed`.
+        The outcomes are noted by the indices `pairs` (m,). `is_placed` is True if the measurements give positions.
         """
         track_ids, measurements = states.track_ids, Measurements(stack)
         ids = list(map(track_ids.__getitem__, of.tolist()))
@@ -132,8 +133,10 @@ def _seen(
     states: StatesAt,
     read: YawsRead | None,
 ) -> Iterator[tuple[IntArray, IntArray, Measurement, IntArray | None]]:
-    """Yield the measurements of the `members` of a group, whose pairs have the indices `here`, as they are `read`.
-    `tracks` are those of all pairs. Each stack comes with the indices of its pairs, their tracks and readings.
+    """Yield stacks of measurements of the `members` of a group, with the readings in `read`.
+
+    `here` are the indices of their pairs, and `tracks` are the tracks of all pairs. Each stack comes after the indices
+    of its pairs and their tracks, and before its readings.
     """
     of = tracks.take(here)
     each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)

@@ -38,19 +38,19 @@ class TrackerParts:
     birth: Birth
     road: Road
     watermarks: Watermarks
-    """Learns the usual delays, of the sensors and the `EGO`."""
+    """Learns the usual delays of the sensors and of the `EGO`."""
     objects: Objects = field(default_factory=Objects)
     joint: GatedMahalanobis | None = None
     """Gate of the detections that update a track together, and the distance from confirmed tracks within which no
     detection starts another one; None where each updates one track and any may start one."""
     weigh_births: Callable[[str, int, Sequence[int], Pairs], BoolArray] | None = None
-    """See `ExistenceLifecycle.likely`; None where births are not weighed."""
+    """See `ExistenceLifecycle.likely`; None if births are not weighed."""
     facing: Facing | None = None
-    """Belief about the fronts of tracks; None where every yaw is taken as it is."""
+    """Log-odds of the fronts of tracks; None if every yaw is used as it was measured."""
     wait: PoseWait | None = None
-    """Decides which lists wait for an ego message; None where none waits."""
+    """Decides which lists wait for an ego message; None if no list waits."""
     failures: Failures = field(default_factory=Failures)
-    """Counts what fails inside, shared with `bank`."""
+    """Counts failures of all parts, also of `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
     """Exceptions that the processing of a batch lets out; after any other one, it ends as failed."""
 

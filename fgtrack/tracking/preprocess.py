@@ -52,16 +52,16 @@ class Candidate(NamedTuple):
     """A detection, or several merged ones, ready for association."""
 
     leader: int
-    """Position, in the message, of the detection that carries the outcome."""
+    """Index in the message of the detection whose record has the outcome."""
     merged: tuple[int, ...]
-    """Positions of the others that were merged into it and have no outcome of their own."""
+    """Indices in the message of the detections that were merged into the leader and have no outcome of their own."""
     measurement: Measurement
     position_m: FloatArray | None
-    """Position in the map, shape (2,); None where none was measured."""
+    """Position in the map, shape (2,); None if no position was measured."""
     position_covariance: FloatArray | None
     """Shape (2, 2)."""
     stamp_std_s: float = 0.0
-    """Standard deviation of its stamp, of which nothing is in the covariances."""
+    """Standard deviation of the stamp, which is not contained in the covariances."""
 
     @property
     def values(self) -> dict[str, float]:
@@ -84,16 +84,17 @@ class StampError(NamedTuple):
     def rate(
         self, model: MeasurementModel, pose: SensorPose, x: FloatArray
     ) -> FloatArray:
-        """Derivative v of h(x) by the stamp at the states `x` (..., n), shape (..., k)."""
+        """Return the derivative of h(x) by the stamp at the states `x` (..., n), shape (..., k)."""
         moved = model.predict(self.motion.predict(x, _STEP_S), pose)
         return model.residual(moved, model.predict(x, pose)) / _STEP_S
 
     def noise(
         self, model: MeasurementModel, pose: SensorPose, x: FloatArray, P: FloatArray
     ) -> FloatArray:
-        """Covariance sigma_t^2 E[v v'], shape (m, k, k), at the states `x` (m, n) with covariances `P`.
-        E[v v'] = v v' + D P D' with D = dv/dx, which is the derivative of H F by time: the velocity of a new track is
-        its uncertainty.
+        """Return the covariance sigma_t^2 E[v v'], shape (m, k, k), at the states `x` (m, n) with covariances `P`.
+
+        E[v v'] = v v' + D P D', where v is `rate` and D = dv/dx is the derivative of H F by time. For a new track D P
+        D' is the larger part: its velocity is unknown.
         """
         v, (moved, F, _) = self.rate(model, pose, x), self.motion.transition(x, _STEP_S)
         D = (model.jacobian(moved, pose) @ F - model.jacobian(x, pose)) / _STEP_S
@@ -103,7 +104,7 @@ class StampError(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Candidates that differ in their numbers alone."""
+    """Candidates with the same components, which differ only in their numbers."""
 
     rows: IntArray
     """Indices of the candidates, ascending, shape (m,)."""
@@ -112,14 +113,14 @@ class Group(NamedTuple):
     spread: FloatArray
     """Covariances of the detections with all their errors, shape (m, k, k)."""
     error: PoseError | None
-    """Error of the ego in them, stacked; None where it is not considered."""
+    """Error of the ego pose in the detections, stacked; None if it is not considered."""
     stamp_error: StampError | None = None
-    """Error of the stamp, of which nothing is in `stack` and `spread`; None where it is not considered."""
+    """Error of the stamp, which is not contained in `stack` and `spread`; None if it is not considered."""
 
     def noise(
         self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
     ) -> FloatArray:
-        """R of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
+        """Return R of `members` (p,) for objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
         own = self.stack
         R = own.R.take(members, axis=0)
         if self.error is not None and own.model.relative:
@@ -131,7 +132,7 @@ class Group(NamedTuple):
     def seen_at(
         self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
     ) -> Measurement:
-        """The stack of some `members`, ascending, see `noise`."""
+        """Return the stack of measurements of `members`, ascending. The arguments are those of `noise`."""
         own, varies = (
             self.stack,
             self.stamp_error is not None
@@ -145,7 +146,10 @@ class Group(NamedTuple):
         )
 
     def position_covariances(self, members: IntArray) -> FloatArray:
-        """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
+        """Return the covariances of the positions of `members` (p,) in the map, shape (p, 2, 2).
+
+        All members must have a position.
+        """
         own, R = self.stack, self.spread.take(members, axis=0)
         if own.model.components[:2] == ("x_m", "y_m"):
             return R[:, :2, :2]
@@ -202,7 +206,9 @@ class Candidates(Lazy[Candidate]):
         disposition: Disposition,
         track_id: int | None = None,
     ) -> list[tuple[UpdateRecord, ...]]:
-        """Return the records of candidates of `batch`, each with those of the detections that were merged into it."""
+        """Return the records of candidates of `batch`, each with the records of the detections that were merged into
+        it.
+        """
         message = batch.message
         return [
             (
@@ -218,7 +224,7 @@ class Candidates(Lazy[Candidate]):
         return [objects[index] for index in (leader, *self.merged.get(leader, ()))]
 
     def split(self, chosen: IntArray) -> list[tuple[Group, IntArray, IntArray]]:
-        """Return the groups, and of those of the candidates `chosen` (p,) in each the indices there and here."""
+        """Return each group that has candidates of `chosen` (p,), with their indices in the group and in `chosen`."""
         if len(self.groups) == 1:
             return [(self.groups[0], chosen, np.arange(len(chosen)))]
         parts = []
@@ -230,7 +236,7 @@ class Candidates(Lazy[Candidate]):
         return parts
 
     def renew(self, chosen: set[int]) -> None:
-        """Take the whole errors of the `chosen` ones as new, whatever the correlated parts are."""
+        """Count the whole errors of the `chosen` candidates as new, not as errors that are correlated in time."""
         for k, group in enumerate(self.groups):
             if not chosen.isdisjoint(
                 group.rows.tolist()
@@ -285,9 +291,11 @@ class Preprocess:
         detection_origin_m: tuple[float, float],
         assumes_map_yaw: bool = True,
     ) -> None:
-        """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point.
-        `assumes_map_yaw`: a yaw that the map gave is prior knowledge; as published it counts as measured, in the
-        innovations and their NIS.
+        """Prepare the step.
+
+        `detection_origin_m` is the origin of the ego frame of detections, seen from the ego reference point. With
+        `assumes_map_yaw` a yaw from the map is prior knowledge. Without it the yaw counts as measured in the
+        innovations and their NIS, as published.
         """
         self._road = road
         self._merge = merge
@@ -299,15 +307,17 @@ class Preprocess:
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
     ) -> Preprocessed:
         """Return the candidates of a batch, and the records of the rejected detections.
-        `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
+
+        `ego` is the pose at the stamp of the batch; it may be None for detections in the map frame.
         """
         return self.together([self.posed(batch, sensor, ego)])[0]
 
     def posed(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
     ) -> PosedBatch:
-        """Return `batch` with the pose of the frame that its detections are given in, and the velocity of its origin.
-        Of detections in the map the pose that they are seen from: that of the ego, without one the map's origin.
+        """Return `batch` with the pose of the frame of its detections, and the velocity of the frame's origin.
+
+        Detections in the map are measured from the ego frame; without an `ego`, from the origin of the map.
         """
         if ego is None:
             return PosedBatch(batch, sensor, None, SensorPose())
@@ -325,7 +335,9 @@ class Preprocess:
         )
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
-        """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
+        """Return the result of `__call__` for each of `batches`, computed in one pass over the arrays of all
+        batches.
+        """
         lost: list[dict[int, str]] = [{} for _ in batches]
         items = in_map_frame(batches)
         if any(
@@ -344,7 +356,9 @@ class Preprocess:
     def _on_road(
         self, items: MapDetections, lost: Sequence[dict[int, str]]
     ) -> MapDetections:
-        """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
+        """Return the detections inside the road bounds, with yaw and curvature of the map. `lost` gets the other
+        detections.
+        """
         if not self._road.has_track:
             return items
         takes = [
@@ -367,7 +381,9 @@ class Preprocess:
         return _without(items, outside, "map.track", lost)
 
     def _candidates(self, items: MapDetections) -> Iterator[Candidates]:
-        """Yield the candidates of each batch in their order; those that measure the same components are one group."""
+        """Yield the candidates of each batch in their order. Candidates that measure the same components are one
+        group.
+        """
         arrays = items.values, items.points_m, items.map_yaw, items.starts, items.poses
         codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
         for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
@@ -392,8 +408,9 @@ class Preprocess:
     def _groups(
         self, items: MapDetections, k: int, first: int, rows: IntArray, code: int
     ) -> list[Group]:
-        """Return the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
-        One by one where errors are correlated in time.
+        """Return the groups of the candidates `rows` of batch k, which all measure the same components `code`.
+
+        `first` is the first row of the batch. If errors are correlated in time, each candidate is a group of its own.
         """
         here = slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
         (batch, sensor, ego, pose), points_m = items.batches[k], items.points_m[here]
@@ -482,7 +499,10 @@ def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
 
 
 def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
-    """`items` that pass the filters and the ranges of their sensors, moved back from the near side that is seen."""
+    """Return the detections that pass the filters and the ranges of their sensors.
+
+    If a sensor shows the near side of objects, the positions are moved back. `lost` gets the other detections.
+    """
     batches, passes = items.batches, list[bool]()
     for k, index in zip(items.of.tolist(), items.indices.tolist(), strict=True):
         batch, sensor, _, _ = batches[k]
@@ -516,7 +536,9 @@ def _without(
     reason: str,
     lost: Sequence[dict[int, str]],
 ) -> MapDetections:
-    """`items` without those `outside`, shape (m,), whose indices `lost` of their batch gets with the `reason`."""
+    """Return the detections that are not `outside` (m,). The dictionary in `lost` of their batch gets the indices of
+    the other detections, with the `reason`.
+    """
     rows = outside.nonzero()[0]
     if not len(rows):
         return items
@@ -531,8 +553,9 @@ def _without(
 def _components(
     code: int, map_yaw_is_assumed: bool
 ) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
-    """Names and columns of the measured `COMPONENTS`, see the kernel `described`; names that are assumed; columns.
-    Of the last, -1 of what is assumed.
+    """Return names and columns of the measured `COMPONENTS`, names that are assumed, and columns with -1 for these.
+
+    `code` is the number that the kernel `described` returns.
     """
     columns = np.array([k for k in range(len(COMPONENTS)) if code >> k & 1])
     names = tuple(COMPONENTS[k] for k in columns)
@@ -551,12 +574,12 @@ def _components(
 
 
 def _directions_rad(names: Sequence[str], z: FloatArray) -> FloatArray:
-    """Bearings among the components of z (m, k), shape (m,); along the axis of the sensor where there are none."""
+    """Return the bearings among the components of z (m, k), shape (m,); 0, the axis of the sensor, without bearings."""
     return z[:, names.index("bearing_rad")] if "bearing_rad" in names else 0.0 * z[:, 0]
 
 
 def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:
-    """Points so far along lines of sight (m,) that the position of the sensor no longer matters."""
+    """Return points on lines of sight (m,), so far that the position of the sensor no longer matters."""
     angles_rad = [pose.yaw_rad + bearing_rad for bearing_rad in bearings_rad.tolist()]
     return [
         (pose.x_m + _FAR_M * math.cos(angle), pose.y_m + _FAR_M * math.sin(angle))

@@ -34,7 +34,9 @@ _ITERATIONS = 30
 def joint_probabilities(
     pairs: Pairs, candidates: Candidates, states: StatesAt, sensor: SensorModel
 ) -> Pairs:
-    """Return those of `pairs` whose candidates have a position, with the probability that they belong together."""
+    """Return the `pairs` whose candidates have a position, with the probabilities that candidate and track belong
+    together.
+    """
     pairs = pairs.at(np.array(candidates.placed, dtype=bool)[pairs.rows])
     rows, columns, _ = pairs
     densities = position_densities(
@@ -47,9 +49,10 @@ def joint_probabilities(
 
 
 def marginals(weights: FloatArray) -> FloatArray:
-    """Return the probabilities, shape (m, n), that pairs of m tracks and n detections belong together.
-    Sums over all joint events, by belief propagation (Williams, Lau, IEEE T-AES 50, 2014): exact where no tracks
-    compete for two detections in a circle. `weights` (m, n) are relative to a missed detection and clutter.
+    """Return the probabilities, shape (m, n), that m tracks and n detections belong together.
+
+    They are sums over all joint events, by belief propagation (Williams, Lau, IEEE T-AES 50, 2014). They are exact if
+    no tracks compete for two detections in a circle. `weights` (m, n) are relative to a missed detection and clutter.
     """
     ratios = np.ones_like(weights)
     for _ in range(_ITERATIONS):
@@ -68,9 +71,12 @@ def equivalent(
     states: StatesAt,
     readings: IntArray | None = None,
 ) -> Measurement:
-    """Return `seen`, the detections of `group` assigned to `tracks`, as the equivalent measurements; see the module.
-    Tracks that are not in `joint` keep theirs. `seen` has its `readings` (m,), see `fgtrack.tracking.facing`. Of
-    other detections a yaw is the nearer one of the two that are half a turn apart, and a speed has the same sign.
+    """Return the equivalent measurements of all detections of `group` that belong to `tracks`, as in the module
+    docstring.
+
+    `seen` are the detections that are assigned to `tracks`, with their `readings` (m,), see `fgtrack.tracking.facing`.
+    Tracks that are not in `joint` keep their assigned detection. Yaws of other detections are turned by half a turn if
+    this brings them nearer, and their speeds have the sign of the reading.
     """
     z, R = seen.z.copy(), seen.R.copy()
     names = seen.model.components

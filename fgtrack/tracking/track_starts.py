@@ -26,9 +26,9 @@ class TrackStarts:
         scan: Scan,
         records: list[Iterable[UpdateRecord]],
     ) -> int | None:
-        """Return the number of a new track, None without one; `records` get those of the candidate.
+        """Start a track and return its number; None if no track starts. `records` get the records of the candidate.
 
-        A track whose start fails leaves nothing.
+        If the start fails, nothing of the track is kept.
         """
         first, track_id, is_born = len(records), None, False
         try:
@@ -53,7 +53,7 @@ class TrackStarts:
         return track_id if is_born else None
 
     def _prior(self, candidates: Candidates, position: int, scan: Scan) -> Start | None:
-        """Return the state that a track begins with; None where the candidate may start no track."""
+        """Return the first state of a track; None if the candidate may not start a track."""
         parts, candidate = self._parts, candidates[position]
         if not parts.sensors[scan.sensor].births:
             return None
@@ -74,7 +74,7 @@ class TrackStarts:
         scan: Scan,
         prior: Start,
     ) -> None:
-        """Note what the tracker keeps of a track that the bank has started."""
+        """Note the data of a track that the bank has started, in all other parts of the tracker."""
         parts, candidate = self._parts, candidates[position]
         self._tracks.begin(track_id, scan.sensor, prior)
         if parts.facing is not None:

@@ -174,7 +174,7 @@ class MultiObjectTracker:
         self._parts.inbox.put(message)
 
     def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
-        """Process everything received up to `now_ns`, but for lists that wait for an ego message.
+        """Process everything received up to `now_ns`, except lists that wait for an ego message.
 
         At a tick that `is_last` no list waits any longer.
         """
@@ -426,7 +426,7 @@ class MultiObjectTracker:
     def _give_birth(
         self, batch: Batch, candidates: Candidates, position: int, scan: Scan
     ) -> None:
-        """Start a track, if the sensor and the birth rules want one."""
+        """Start a track with a candidate, if the sensor and the birth rules want a track."""
         track_id = self._starts.give_birth(
             batch, candidates, position, scan, self._records
         )
@@ -434,7 +434,7 @@ class MultiObjectTracker:
             self._seen.setdefault(id(batch.message), set()).add(track_id)
 
     def _is_too_old(self, batch: Batch) -> bool:
-        """True if no track could fuse anything of `batch`."""
+        """True if no track could fuse a detection of `batch`."""
         return batch.stamp_ns < self._parts.bank.window_start_ns
 
     def _offered(self, batch: Batch) -> StatesAt:
@@ -480,9 +480,11 @@ class MultiObjectTracker:
     def _miss(
         self, batch: Batch, assignment: Assignment, states: StatesAt, scan: Scan
     ) -> None:
-        """Lives of missed tracks, where it is positions that are seen; tracks that run out end here.
+        """Count the misses of tracks, if the sensor gives positions and has `scan`. End the tracks whose counts run
+        out.
+
         A track is missed by a message as a whole, so only its last batch counts. The list may end a track that it has
-        matched, where clutter explains the match better. So tracks end after the list has been fused.
+        matched, if clutter explains the match better. So tracks end after the list has been fused.
         """
         sensor = self._parts.sensors[batch.message.sensor]
         if not batch.last or not (sensor.gives_position and sensor.scan):

@@ -161,7 +161,7 @@ def updated_one(
 def correct_one(
     mean: FloatArray, covariance: FloatArray, measurement: Measurement
 ) -> OneCorrection:
-    """Return one state, shapes (n,) and (n, n), after `measurement`. Raises as `updated_one`."""
+    """Return one state, shapes (n,) and (n, n), after `measurement`. Raises the exceptions of `updated_one`."""
     y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
     return updated_one(
         mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured

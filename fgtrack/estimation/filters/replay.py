@@ -158,7 +158,10 @@ class ReplayEkf(WindowedFilter):
     def _step(
         self, before: Step, measurement: Measurement
     ) -> tuple[Step, OneCorrection]:
-        """Return the step of `measurement` after the step `before`, and its correction. Raises as `correct`."""
+        """Return the step of `measurement` after the step `before`, and its correction.
+
+        Raises the exceptions of `correct`.
+        """
         predicted = self._ahead(before, measurement.stamp_ns)
         corrected = self.correct(predicted.mean, predicted.covariance, measurement)
         return self._concluded(before, measurement, predicted, corrected), corrected

@@ -165,7 +165,7 @@ def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bo
 def view_of_sequence(path: Path) -> list[View]:
     """Return the ego at every frame of a sequence; `path` is its folder, or its file in `oxts/`.
 
-    Raises as `read_sequence`.
+    Raises the exceptions of `read_sequence`.
     """
     views, error = read_views(*_folder_and_sequence(path))
     if error is not None:

@@ -160,7 +160,9 @@ class Likelihood:
         return np.sqrt(np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse)))
 
     def _curvature(self, logs: FloatArray) -> FloatArray:
-        """Return the negative second derivatives of the log-likelihood, shape (f, f)."""
+        """Return the negative second derivatives of the log-likelihood by the logarithms of the parameters, shape
+        (f, f).
+        """
         f, h = len(logs), _CURVATURE_DIFFERENCE
         item = h * np.eye(f)
         first, second = np.triu_indices(f)

@@ -77,7 +77,7 @@ class EgoGrowth(Stateful):
     ) -> None:
         """Assume these standard deviations of acceleration and yaw acceleration until the ego has shown its own.
 
-        `density_m2ps3` is that of the velocity of the objects.
+        `density_m2ps3` is the noise density of the velocities of the objects.
         """
         self._density = density_m2ps3
         self._assumed = np.square([accel_std_mps2, yaw_accel_std_radps2])
@@ -212,9 +212,9 @@ class EgoGrowth(Stateful):
         stamp_ns: int,
         range_m: float | None = None,
     ) -> FloatArray:
-        """Return `covariance` as it counts for a list at `stamp_ns`, and note that the list shares the error.
+        """Return the `covariance` that counts for a list at `stamp_ns`. Note that the list shares the error.
 
-        `range_m` is the usual distance of its objects, None where it is unknown.
+        `range_m` is the usual distance of the objects of the list; None if it is unknown.
         """
         range_m = _RANGE_M if range_m is None else range_m
         parts, (_, times_s) = self._parts(ego, duration_s), self._of(abs(duration_s))

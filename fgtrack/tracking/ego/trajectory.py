@@ -59,7 +59,7 @@ class EgoPose(NamedTuple):
     speed_mps: float
     yaw_rate_radps: float = 0.0
     covariance: FloatArray | None = None
-    """Covariance of the five above, shape (5, 5), read-only; None where it is unknown or not requested."""
+    """Covariance of the five fields above, shape (5, 5), read-only; None if it is unknown or not requested."""
     extrapolated_s: float = 0.0
     """Time from the nearest state to a pose that is extrapolated; below 0 before the first state, 0 between states."""
 
@@ -75,9 +75,11 @@ def extrapolated(
     covariance: FloatArray | None = None,
     straight: bool = False,
 ) -> EgoPose:
-    """Pose of `ego` moved to `stamp_ns` on the circle that it drives, with the yaw extrapolated (not wrapped).
-    `covariance`, shape (5, 5), is that of `ego`; what the ego does meanwhile besides is not added to it. `straight`:
-    the position goes on along the heading, as in the published tracker; at 60 m/s and 0.4 rad/s 12 m off after 1 s.
+    """Return the pose of `ego` moved to `stamp_ns` on the circle that it drives. The yaw is not wrapped.
+
+    `covariance`, shape (5, 5), is the covariance of `ego`; deviations from the circle are not added. With `straight`
+    the position moves along the heading, as in the published tracker; at 60 m/s and 0.4 rad/s this is 12 m off after
+    1 s.
     """
     dt_s = (stamp_ns - ego.stamp_ns) / NS_PER_S
     half_rad = 0.0 if straight else 0.5 * ego.yaw_rate_radps * dt_s
@@ -113,7 +115,7 @@ def extrapolated(
 
 
 class EgoStd(NamedTuple):
-    """Standard deviations of an ego state that are taken where it gives none; 0 for exactly known."""
+    """Standard deviations that replace missing standard deviations of an ego state; 0 for an exact value."""
 
     position_m: float = 0.0
     yaw_rad: float = 0.0
@@ -123,7 +125,10 @@ class EgoStd(NamedTuple):
 
 @lru_cache(maxsize=1024)  # one localisation often reports the same for all its states
 def _completed(given: tuple[float, ...] | None, std: EgoStd) -> FloatArray | None:
-    """The covariance `given`, shape (5, 5), read-only, with `std` instead of variances of 0; None for all zero."""
+    """Return the covariance `given`, shape (5, 5), read-only, in which `std` replaces variances of 0.
+
+    A covariance that is None counts as 0. Returns None if the result is 0.
+    """
     P = np.zeros((5, 5)) if given is None else symmetrise(np.array(given).reshape(5, 5))
     P += np.diag(np.where(np.diag(P) > 0.0, 0.0, np.square((std.position_m, *std))))
     P.flags.writeable = False
@@ -224,7 +229,10 @@ class EgoTrajectory(Stateful):
         """True if the ego was last reported in the pit lane."""
 
     def receive(self, ego: EgoState) -> str | None:
-        """Take a message; the reason, where it is refused, or one that was held back."""
+        """Receive a state of the ego. Return the reason if it is refused, or if the state held back before is refused.
+
+        None if no state is refused.
+        """
         if ego.in_pit is not None:
             self.in_pit = ego.in_pit
         if not is_finite(ego):
@@ -251,19 +259,20 @@ class EgoTrajectory(Stateful):
         return ego if pose is None else replace(ego, x_m=pose.x_m, y_m=pose.y_m)
 
     def start_tick(self) -> None:
-        """A tick begins; nothing depends on ticks here."""
+        """Begin a tick; this trajectory does not depend on ticks."""
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest state that poses are taken from; None before the first."""
+        """Stamp of the newest state from which poses are taken; None before the first state."""
         return self._stamps[-1] if self._stamps else None
 
     def placed(
         self, stamp_ns: int, present_ns: int, range_m: Callable[[], float | None]
     ) -> EgoPose | None:
-        """Return `pose_at` for a list that is placed by it; `range_m` returns the usual distance of its objects.
+        """Return `pose_at` for a list whose detections are moved into the map by this pose.
 
-        The error of an extrapolated pose lasts for several lists: its growth counts as `EgoGrowth` describes.
+        `range_m` returns the usual distance of the objects of the list. The error of an extrapolated pose lasts for
+        several lists: its growth counts as `EgoGrowth` describes.
         """
         pose = self.pose_at(stamp_ns, present_ns)
         if pose is None or self._growth is None or not pose.extrapolated_s:
@@ -276,16 +285,20 @@ class EgoTrajectory(Stateful):
         )
 
     def growth_at(self, stamp_ns: int) -> FloatArray | None:
-        """Covariance that extrapolation from the nearest state to `stamp_ns` adds, shape (5, 5); None if unknown."""
+        """Covariance that an extrapolation from the nearest state to `stamp_ns` adds, shape (5, 5).
+
+        None if the trajectory has no states, or does not learn the growth.
+        """
         if self._growth is None or not self._stamps:
             return None
         nearest = self._nearest(stamp_ns)
         return self._growth.covariance(nearest, seconds(stamp_ns - nearest.stamp_ns))
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """Pose at `stamp_ns`, or None where it is unknown; `present_ns` is the tracking time.
-        Beyond its ends, and into a gap, the trajectory is extrapolated for a limited time. A gap is longer than all
-        that two extrapolations, one from either side, could cover.
+        """Return the pose at `stamp_ns`, or None if it is unknown. `present_ns` is the tracking time.
+
+        Beyond its ends, and into a gap, the trajectory is extrapolated for a limited time. A gap is longer than two
+        extrapolations, from both sides, can bridge.
         """
         if not self._stamps:
             return None
@@ -301,7 +314,7 @@ class EgoTrajectory(Stateful):
         return self._extrapolated(nearest, stamp_ns)
 
     def _around(self, stamp_ns: int) -> Sequence[EgoState]:
-        """Return the states before and after `stamp_ns`, at least one of them."""
+        """Return the states before and at or after `stamp_ns`; a single state beyond the ends."""
         row = bisect.bisect_left(self._stamps, stamp_ns)
         return self._states[max(row - 1, 0) : row + 1]
 
@@ -309,7 +322,9 @@ class EgoTrajectory(Stateful):
         return min(self._around(stamp_ns), key=lambda ego: abs(stamp_ns - ego.stamp_ns))
 
     def _store(self, ego: EgoState) -> str | None:
-        """Take a state; the reason, where it is refused, or one that was held back."""
+        """Insert a state, or hold it back. Return the reason if it, or the state held back before, is refused; else
+        None.
+        """
         last, held, self._held = self._last, self._held, None
         if last is None or _consistent(last, ego):
             self._fits, self._last = last is not None, ego
@@ -328,7 +343,10 @@ class EgoTrajectory(Stateful):
         return self._insert(ego) or reason
 
     def _insert(self, ego: EgoState) -> str | None:
-        """Insert a state by its stamp, a late one unfiltered; the reason, where it is refused."""
+        """Insert a state by its stamp. Return the reason if it is refused, else None.
+
+        Only the newest state is low-passed.
+        """
         stamps_ns = self._stamps
         row = bisect.bisect_left(stamps_ns, ego.stamp_ns)
         if row == len(stamps_ns):
@@ -357,7 +375,7 @@ class EgoTrajectory(Stateful):
         return None
 
     def _reckon(self, row: int, time_s: float) -> None:
-        """Move the states from a new one at `row` on to where dead reckoning has them."""
+        """Move the states from the new state at `row` on to the positions of dead reckoning."""
         reported = [self._states[row], *(ego for ego, _ in self._reckoned[row:])]
         del self._reckoned[row:]
         for k, ego in enumerate(reported, row):
@@ -418,7 +436,7 @@ class EgoTrajectory(Stateful):
     def _low_passed(
         self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float
     ) -> EgoState:
-        """`ego` with its yaw and yaw rate drawn towards the given ones."""
+        """Return `ego` with its yaw and yaw rate drawn towards `yaw_rad` and `yaw_rate_radps`."""
         values = list(
             _VALUES(ego)
         )  # in a third of the time of `dataclasses.replace`, at every message
@@ -432,9 +450,11 @@ class EgoTrajectory(Stateful):
     def _interpolated(
         self, before: EgoState, after: EgoState, stamp_ns: int
     ) -> EgoPose:
-        """Pose between two states, the short way round, with the mean of their covariances (None counts as zero).
-        The error of (1 - share) a + share b has at most this covariance, and just this where the two errors are the
-        same, as those of a localisation within a moment nearly are. Between states that are far apart see `_bridged`.
+        """Return the pose between two states, with the mean of their covariances (None counts as zero).
+
+        The yaw turns the short way. The error of (1 - share) a + share b has at most this covariance. It has just this
+        covariance if both errors are equal, as the errors of a localisation at nearby times nearly are. `_bridged`
+        serves states that are far apart.
         """
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
         covariance = newer = None
@@ -473,10 +493,11 @@ class EgoTrajectory(Stateful):
         stamp_ns: int,
         covariance: FloatArray | None,
     ) -> EgoPose:
-        """Pose between two states that are far apart: the states extrapolated from either side, by their certainties.
+        """Return the pose between two states that are far apart: extrapolations from both, weighted by their
+        certainties.
 
-        What drives the ego before the stamp is independent of what drives it after, so the two are fused as
-        independent estimates. To the covariance of the result comes the `covariance` that the states have.
+        The accelerations before and after the stamp are independent, so both extrapolations are fused as independent
+        estimates. The `covariance` of the states is added to the covariance of the result.
         """
         first, second = (
             np.array(extrapolated(ego, stamp_ns)[:5]) for ego in (before, after)

@@ -32,7 +32,7 @@ def places(batch: Batch, sensor: SensorModel) -> bool:
 
 
 def range_of(batch: Batch) -> float | None:
-    """Return the median distance of the detections of `batch` from where they are seen; None if it is not measured."""
+    """Return the median of the measured distances of the detections of `batch`; None if no distance is measured."""
     ranges_m = [
         range_m
         for range_m in map(partial(_range_of, batch), batch.indices)
@@ -42,7 +42,7 @@ def range_of(batch: Batch) -> float | None:
 
 
 def _range_of(batch: Batch, index: int) -> float | None:
-    """Return the distance of a detection; positions in the map give none."""
+    """Return the measured distance of a detection from its sensor or the ego; None if it is not measured."""
     detection = batch.message.objects[index]
     if batch.message.frame == "map" or detection.x_m is None or detection.y_m is None:
         return detection.range_m
@@ -84,7 +84,7 @@ class PoseWait:
 
 
 def _losses(batch: Batch, sensor: SensorModel, growth: FloatArray) -> Iterator[float]:
-    """Yield by how many times its variance an extrapolated pose makes each detection of `batch` worse.
+    """Yield, for each detection of `batch`, the factor by which an extrapolated pose increases its variance.
 
     `growth`, shape (5, 5), is the covariance of x, y, yaw, speed and yaw rate that the extrapolation adds.
     """

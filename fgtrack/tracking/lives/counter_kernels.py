@@ -57,7 +57,7 @@ def _have_room(rows: IntArray, counters: IntArray, changes: IntArray) -> bool:
 
 @inlined
 def _counted(counter: int, decrement: int, most: int) -> int:
-    """Return the counter after a change; a counter that was more than `most` may fall only."""
+    """Return the counter after a change. A counter above `most` may only decrease."""
     if decrement > 0:
         return counter - decrement
     return min(counter - decrement, most)
@@ -73,9 +73,9 @@ def _change(
     counters: IntArray,
     changes: IntArray,
 ) -> None:
-    """Insert a change by its stamp, and count again from the changes that no late list can precede.
+    """Insert a change by its stamp, and recount from the changes that no late list can precede.
 
-    At one stamp matches precede misses. Unless a track `awaits` late lists, changes count in order of arrival.
+    At the same stamp matches precede misses. Unless a track `awaits` late lists, changes count in order of arrival.
     """
     if not awaits:
         counters[own, COUNTER] = _counted(counters[own, COUNTER], decrement, most)
@@ -145,7 +145,7 @@ def match(
 ) -> bool:
     """Count that a list of `sensor` shows the tracks in `rows`.
 
-    False, and nothing is changed, where room is missing.
+    Returns False, and changes nothing, if the arrays have no room for the changes.
     """
     _check(rows, counters, changes, could_show, expected_ns)
     check(0 <= sensor < could_show.shape[1])
@@ -177,9 +177,10 @@ def miss(
     could_show: BoolArray,
     expected_ns: IntArray,
 ) -> bool:
-    """Note the `views` (m, sensors) of tracks that a list misses, and count the miss of those that it `ages` (m,).
+    """Note the `views` (m, sensors) of tracks that a list misses, and count the misses of the tracks that it `ages`
+    (m,).
 
-    False, and nothing is changed, where room is missing.
+    Returns False, and changes nothing, if the arrays have no room for the changes.
     """
     _check(rows, counters, changes, could_show, expected_ns)
     check(len(ages) == len(rows) and len(views) == len(rows))
@@ -237,7 +238,9 @@ def ended(
     could_show: BoolArray,
     expected_ns: IntArray,
 ) -> BoolArray:
-    """True of the tracks in `rows` whose counters have reached 0 at a stamp that no late list can precede, (m,)."""
+    """Return True for each track in `rows` whose counter has reached 0 at a stamp that no late list can precede,
+    (m,).
+    """
     _check(rows, counters, changes, could_show, expected_ns)
     check(len(watermarks_ns) == could_show.shape[1])
     result = np.empty(len(rows), dtype=np.bool_)
@@ -266,9 +269,9 @@ def expire(
     expected_ns: IntArray,
     result: BoolArray,
 ) -> int:
-    """Return the number of tracks in `rows` that end by now; `result` (m,) is made true of them.
+    """Write True to `result` (m,) for each track in `rows` that ends by now, and return the number of these tracks.
 
-    The changes of other tracks that no late list can precede are settled where there are many.
+    If another track has many changes, the changes that no late list can precede are settled.
     """
     _check(rows, counters, changes, could_show, expected_ns)
     check(len(watermarks_ns) == could_show.shape[1] and len(result) == len(rows))

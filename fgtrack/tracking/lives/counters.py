@@ -28,7 +28,7 @@ from fgtrack.tracking.rows import FEWEST, TrackRows
 
 
 class Scan(NamedTuple):
-    """Sensor, time and pose of a list: all of it that matters to the life of tracks."""
+    """Sensor, time, pose and detections of a list, which determine the life of tracks."""
 
     sensor: str
     stamp_ns: int
@@ -187,7 +187,7 @@ class CountingLifecycle(Stateful):
         self._count(kernels(_KERNELS).match, *match)
 
     def _count(self, function: Callable[..., bool], *change: object) -> None:
-        """Call a compiled loop that adds one change to tracks, in larger arrays where room is missing."""
+        """Call a compiled loop that adds one change to tracks. The arrays are enlarged if they have no room."""
         most, awaits = self._rules.counter_cap, self._awaits
         while not function(*change, most, awaits, *self._arrays):
             num_tracks, num_changes, _ = self._arrays[1].shape
@@ -215,7 +215,7 @@ class CountingLifecycle(Stateful):
         return list(compress(track_ids, self._ends(rows, scan).tolist()))
 
     def _ages(self, sensor: str, ranges_m: FloatArray) -> BoolArray:
-        """True of tracks at `ranges_m` (m,) that `sensor` counts down when it misses them, shape (m,)."""
+        """Return True for each track at `ranges_m` (m,) whose counter falls if `sensor` misses it, shape (m,)."""
         ages = self._sensors[sensor].ages
         if ages in ("always", "never"):
             return np.full(len(ranges_m), ages == "always")
@@ -223,7 +223,7 @@ class CountingLifecycle(Stateful):
         return np.asarray(near if ages == "short_range" else ~near)
 
     def _ends(self, rows: IntArray, scan: Scan) -> BoolArray:
-        """True of the tracks in `rows` that end at a list that misses them, shape (m,)."""
+        """Return True for each track in `rows` that ends because a list has missed it, shape (m,)."""
         if not self._awaits:
             return np.asarray(self._arrays[0][rows, COUNTER] <= 0)
         ended: BoolArray = kernels(_KERNELS).ended(
@@ -262,8 +262,9 @@ class CountingLifecycle(Stateful):
         return list(compress(self._rows.by_id, ended.tolist())) if number else []
 
     def suspended(self, stamp_ns: int | None = None) -> frozenset[int]:
-        """The ids of tracks that end unless a list shows them that is still due, at `stamp_ns` or at all.
-        They are not published. Counts suspend no track: a late match may precede the misses so far.
+        """Return the ids of tracks that end unless a list that is still due shows them, at `stamp_ns` or at any stamp.
+
+        They are not published. Counts suspend no track, because a late match may precede the misses so far.
         """
         return frozenset()
 

@@ -237,7 +237,7 @@ class ExistenceLifecycle(Stateful):
         self._matches.append(_Matches(rows, *own))
 
     def _settle(self) -> None:
-        """Add the matches since the last time to the histories: of lists of one detection each, many at once."""
+        """Add the matches since the last call to the histories, in one pass."""
         if not self._matches:
             return
         tracks, stamps, of, *others = zip(*self._matches, strict=True)
@@ -357,7 +357,7 @@ class ExistenceLifecycle(Stateful):
     def reported(
         self, track_ids: Sequence[int]
     ) -> tuple[list[TrackStatus], Sequence[float | None]]:
-        """See `CountingLifecycle.reported`; probabilities are those of now."""
+        """See `CountingLifecycle.reported`. The probabilities are those at present."""
         self._settle()
         rows = self._rows.of(track_ids)
         codes, exists = np.empty(len(rows), dtype=np.int64), np.empty(len(rows))
@@ -374,13 +374,18 @@ class ExistenceLifecycle(Stateful):
         ratios: FloatArray,
         confirm_probability: float,
     ) -> None:
-        """Add evidence (m,) to the histories, `ratios` NaN out of view; tracks are confirmed from a probability on."""
+        """Add evidence (m,) to the histories; `ratios` are NaN for tracks out of view.
+
+        Tracks are confirmed from `confirm_probability` on.
+        """
         evidence = rows, stamps_ns, sensors, ratios
         found = *self._histories.learn(*evidence), confirm_probability
         kernels(_KERNELS).note(*evidence, *found, *self._arrays)
 
     def _ended(self) -> list[int]:
-        """Return the ids of the tracks that end, and suspend those that end if nothing more shows them."""
+        """Return the ids of the tracks that end. Suspend the tracks that end unless a list that is still due shows
+        them.
+        """
         rows, rules = self._rows.every, self._rules
         verdicts = np.empty(len(rows), dtype=np.int64)
         known = self._watermarks_ns, self._processed_ns, self._present_ns
@@ -434,8 +439,9 @@ def after_jumps(
     reaches_m: FloatArray,
     sensor: SensorModel,
 ) -> Assignment:
-    """Return `assignment` in which refused candidates update tracks without one, at most `reaches_m` away.
-    A jump of the error must be likelier than clutter; the whole error counts as new, in `candidates` as well.
+    """Return `assignment` in which refused candidates update tracks without a candidate, at most `reaches_m` away.
+
+    A jump of the error must be likelier than clutter. The whole error counts as new, in `candidates` as well.
     """
     if sensor.correlation is None or not assignment.refused:
         return assignment

@@ -89,7 +89,8 @@ def miss(
 ) -> FloatArray:
     """Note the `views` (m, sensors) of the tracks in `rows` that a list of `sensor` misses.
 
-    Returns the likelihood ratios of their existence, shape (m,): `ratio`, and NaN out of the view of the sensor.
+    Returns the likelihood ratios of their existence, shape (m,): `ratio`, or NaN for a track out of the view of the
+    sensor.
     """
     _check(rows, lives, flags, could_show, expected_ns)
     check(len(views) == len(rows) and views.shape[1] == could_show.shape[1])
@@ -127,10 +128,11 @@ def note(
     could_show: BoolArray,
     expected_ns: IntArray,
 ) -> None:
-    """Note when tracks were in view and probably visible, by evidence (m,) that the histories have; confirm tracks.
+    """Note the stamps at which tracks were in view and probably visible. Confirm tracks.
 
-    `ratios` are NaN out of view. `visible` and `exists` are the probabilities that `Histories.learn` returns. A track
-    that has travelled is confirmed from `confirm_probability` on.
+    The evidence (m,) is already in the histories. `ratios` are NaN for tracks out of view. `visible` and `exists` are
+    the probabilities that `Histories.learn` returns. A track that has travelled is confirmed from `confirm_probability`
+    on.
     """
     _check(rows, lives, flags, could_show, expected_ns)
     check_rows(sensors, 0, could_show.shape[1])
@@ -173,8 +175,8 @@ def judge(
 ) -> int:
     """Return the number of tracks in `rows` that do not stay; `verdicts` (m,) are `STAYS`, `ENDS` or `SUSPENDED`.
 
-    A track ends that was out of view, or hidden, for too long, or whose object is improbable. It is suspended where it
-    is improbable unless a list shows it that is still due. `scans_ns`: ascending stamps of the lists.
+    A track ends if it was out of view or hidden for too long, or if its object is improbable. It is suspended if its
+    object is improbable unless a list that is still due shows it. `scans_ns` are the ascending stamps of the lists.
     """
     _check(rows, lives, flags, could_show, expected_ns)
     check_histories(rows, numbers, entries, counts)
@@ -227,9 +229,10 @@ def report(
     statuses: IntArray,
     exists: FloatArray,
 ) -> None:
-    """Write the statuses `TENTATIVE`, `CONFIRMED` or `COASTING`, and the probabilities of now, both shape (m,).
+    """Write the statuses `TENTATIVE`, `CONFIRMED` or `COASTING`, and the probabilities at present, both shape (m,).
 
-    The status follows from what is known: a late sensor leaves its tracks no doubt.
+    The status depends on the probability at the stamp up to which all lists have come. So a late sensor does not make
+    its tracks tentative.
     """
     _check(rows, lives, flags, could_show, expected_ns)
     check_histories(rows, numbers, entries, counts)

@@ -15,9 +15,10 @@ def decided_ns(
 ) -> int:
     """Return the stamp up to which all lists that could show the object of track `own` have come and are processed.
 
-    `watermarks_ns` are those of the sensors, shape (sensors,). `could_show` (tracks, sensors): sensors that could show
-    each object as far as is known. `expected_ns` (tracks, sensors): newest stamps at which they could. A sensor counts
-    if it could show the object now, or at a stamp whose list has not come. `FOREVER` where no sensor counts.
+    `watermarks_ns` are the watermarks of the sensors, shape (sensors,). `could_show` (tracks, sensors) marks the
+    sensors that could show the object at the newest stamp. `expected_ns` (tracks, sensors) are the newest stamps at
+    which they could show it. A sensor counts if it could show the object now, or at a stamp whose list has not come.
+    Returns `FOREVER` if no sensor counts.
     """
     decided = FOREVER
     for k in range(len(watermarks_ns)):

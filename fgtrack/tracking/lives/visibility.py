@@ -27,8 +27,10 @@ _KERNELS = "fgtrack.tracking.lives.visibility_kernels"
 
 
 class Histories(Stateful):
-    """Evidence of all tracks in order of its stamps, and the probabilities after each, whatever the order of arrival.
-    Entry 0 of a track is its birth, or all that is older than what is remembered.
+    """Evidence of all tracks by stamp, and the probabilities after each entry; both do not depend on the order of
+    arrival.
+
+    Entry 0 of a track is its birth, or summarises all evidence that is older than the remembered evidence.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -44,8 +46,10 @@ class Histories(Stateful):
         visible_share: float,
         visible_s: float,
     ) -> None:
-        """`lifetime_s`: mean time for which objects exist; `visible_share`, `visible_s`: share of that time for which
-        they are visible to a sensor, and its time constant.
+        """Prepare empty histories.
+
+        `lifetime_s` is the mean time for which objects exist. `visible_share` is the share of this time for which they
+        are visible to a sensor. `visible_s` is the time constant of the visibility.
         """
         self._chain = lifetime_s, visible_share, visible_s
         self.numbers: FloatArray = np.zeros(
@@ -59,7 +63,7 @@ class Histories(Stateful):
         """Number of entries of each track, 0 of a free row."""
 
     def begin(self, row: int, stamp_ns: int, sensor: int, log_odds: float) -> None:
-        """Begin a track in a `row` with these log-odds, visible to the `sensor` that started it."""
+        """Begin a track in a `row` with the log-odds of its existence. The object is visible to the `sensor`."""
         while row >= len(self.counts):
             self._grow(axis=0)
         numbers, entries = self.numbers[row, 0], self.entries[row, 0]
@@ -74,9 +78,12 @@ class Histories(Stateful):
     def learn(
         self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Add evidence of lists at `stamps_ns` of `sensors` on the tracks in `rows`, one after the other; see `RATIO`.
-        What is older than all that is remembered counts as the oldest. Returns the probabilities, after each, of being
-        visible to its sensor, and the largest ones of existing at its stamp or that of newer evidence, all shapes (m,).
+        """Add evidence of lists at `stamps_ns` (m,) of `sensors` (m,) on the tracks in `rows` (m,), in this order; see
+        `RATIO`.
+
+        Evidence older than all remembered evidence counts at the oldest stamp. Returns two probabilities after each
+        addition, shape (m,): that the object is visible to the sensor, and that it exists. The second is the largest
+        probability at the stamp of the evidence and at newer stamps.
         """
         while (
             len(rows)
@@ -92,15 +99,15 @@ class Histories(Stateful):
 
     @property
     def arrays(self) -> tuple[FloatArray, IntArray, IntArray, float]:
-        """Arguments of `fgtrack.tracking.lives.visibility_kernels.existing_at`."""
+        """Last arguments of `fgtrack.tracking.lives.visibility_kernels.existing_at`."""
         return self.numbers, self.entries, self.counts, self._chain[0]
 
     def present(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
-        """Return the probabilities that the objects exist at `stamps_ns`, not before their newest evidence, (m,)."""
+        """Return the probabilities (m,) that the objects exist at `stamps_ns`, or at newer evidence."""
         return self._existing(rows, stamps_ns, is_known=False)
 
     def known(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
-        """Return the probabilities that the objects exist at `stamps_ns`, by the evidence up to there alone, (m,)."""
+        """Return the probabilities (m,) that the objects exist at `stamps_ns`, from the evidence up to these stamps."""
         return self._existing(rows, stamps_ns, is_known=True)
 
     def _existing(
@@ -111,7 +118,7 @@ class Histories(Stateful):
         return np.asarray(found)
 
     def forget(self, oldest_ns: int) -> None:
-        """Remember what is older than `oldest_ns` by its outcome alone."""
+        """Summarise evidence older than `oldest_ns` by the probabilities that follow from it."""
         kernels(_KERNELS).forget(oldest_ns, self.numbers, self.entries, self.counts)
 
     def end(self, row: int) -> None:
@@ -119,7 +126,7 @@ class Histories(Stateful):
         self.counts[row] = 0
 
     def _grow(self, axis: int) -> None:
-        """Double the tracks, or the entries of each; all is allocated before anything changes."""
+        """Double the number of tracks, or of entries of each track. All arrays are allocated before one is replaced."""
         rows, columns = shape = [*self.numbers.shape[:2]]
         shape[axis] *= 2
         numbers = np.zeros((*shape, self.numbers.shape[2]))

@@ -78,7 +78,7 @@ def _existing(
     entries: IntArray,
     lifetime_s: float,
 ) -> float:
-    """Probability at `stamp_ns`, by the evidence up to entry k and not before it."""
+    """Return the probability at `stamp_ns`, or at entry k if that is newer, from the evidence up to entry k."""
     log_odds = _survived(
         numbers[own, k, LOG_ODDS], stamp_ns - entries[own, k, STAMP], lifetime_s
     )
@@ -95,10 +95,10 @@ def existing_at(
     counts: IntArray,
     lifetime_s: float,
 ) -> float:
-    """Probability that the object of track `own` exists at `stamp_ns`.
+    """Return the probability that the object of track `own` exists at `stamp_ns`.
 
-    It follows from all evidence, or, where `is_known`, from the evidence up to the stamp. A newer list that could not
-    show the object is no evidence.
+    It follows from all evidence. If `is_known`, it follows from the evidence up to the stamp. A newer list that could
+    not show the object is no evidence.
     """
     k = counts[own] - 1
     while (
@@ -142,9 +142,10 @@ def learn(
     visible_share: float,
     visible_s: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Insert entries into the tracks `rows`, each in order of stamps, and recompute from there on.
-    Returns the probabilities of being visible to its sensor, after each, and of existing, the largest one at the stamps
-    from each entry on, shapes (m,).
+    """Insert entries into the tracks `rows`, each by its stamp, and recompute the later entries.
+
+    Returns two probabilities after each insertion, shape (m,): that the object is visible to the sensor, and that it
+    exists. The second is the largest probability at the stamps from the entry on.
     """
     check_histories(rows, numbers, entries, counts)
     num_entries, num_sensors = entries.shape[1], entries.shape[2] - VIEWED
@@ -190,7 +191,7 @@ def existing(
     counts: IntArray,
     lifetime_s: float,
 ) -> FloatArray:
-    """Return existence probabilities at `stamps_ns` (m,), shape (m,); see `existing_at`."""
+    """Return the probabilities of existence at `stamps_ns` (m,), shape (m,); see `existing_at`."""
     check_histories(rows, numbers, entries, counts)
     check(len(stamps_ns) >= len(rows))
     result = np.empty(len(rows))
@@ -205,7 +206,7 @@ def existing(
 def forget(
     oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray
 ) -> None:
-    """Drop entries up to `oldest_ns`; the last of them becomes entry 0."""
+    """Drop the entries up to `oldest_ns` but the last, which becomes entry 0."""
     check(len(numbers) >= len(counts) and len(entries) >= len(counts))
     check_rows(counts, 0, entries.shape[1] + 1)
     for own in range(len(counts)):
