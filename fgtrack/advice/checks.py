@@ -247,7 +247,7 @@ def _unknown(found: SensorOffset) -> str:
 
 
 def _position(evidence: Evidence, name: str, one: Arrivals) -> Check | None:
-    """Test of frame and mount: the positions against those of another sensor."""
+    """Test of frame and mount: compare the positions with the positions of another sensor."""
     found = next((item for item in evidence.agreements if item.sensor == name), None)
     if found is None:
         others = {item.reference for item in evidence.agreements}

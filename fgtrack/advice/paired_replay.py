@@ -89,7 +89,7 @@ class PairedReplay:
 
     @cached_property
     def objects(self) -> IntArray | None:
-        """Index of the true object at each assessed tick and track; `NO_OBJECT` without one.
+        """Index of the true object at each assessed tick and track; `NO_OBJECT` if the track is paired with no object.
 
         None for a recording without truth.
         """

@@ -44,7 +44,7 @@ class NoiseFit:
     ratio: Estimate
     """Mean NIS over its expected value; the interval takes correlated innovations into account."""
     lag1: float | None
-    """Autocorrelation of the sensor's position innovations at lag 1; None without long tracks.
+    """Autocorrelation of the sensor's position innovations at lag 1; None if no track is long enough.
 
     It is near 0 for white errors and consistent noise.
     """

@@ -58,7 +58,7 @@ class Agreement:
     share: float
     """Share of the pairs at the common displacement."""
     displacement_m: tuple[float, float]
-    """Ahead and left in the frame of the ego; east and north without one."""
+    """Displacement ahead and to the left in the frame of the ego; to the east and north without an ego."""
     half_m: float
     """Half of the 95 % interval of each coordinate."""
     limit_m: float

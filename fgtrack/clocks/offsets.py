@@ -93,7 +93,7 @@ _Pair = tuple[MeasuredPositions, ObjectPath]
 
 
 class Bias(NamedTuple):
-    """Constant position error of a sensor, detections minus truth; 0 along an axis without one."""
+    """Constant position error of a sensor, detections minus truth; 0 along an axis without a significant error."""
 
     frame: Literal["ego", "vehicle"]
     """Frame of the error: of the ego, or of the observed vehicle."""

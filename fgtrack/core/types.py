@@ -217,7 +217,7 @@ class TrackReport:
     object: ObjectReport | None = None
     """Class and size; None if no detection reports any."""
     score: float | None = None
-    """Existence probability (`lifecycle.kind: existence`); None for a lifecycle without one."""
+    """Existence probability (`lifecycle.kind: existence`); None for a lifecycle without probabilities."""
 
     @property
     def stamp_ns(self) -> int:

@@ -41,7 +41,7 @@ class Bounds(NamedTuple):
     arrived: FloatArray
     """Bound from the measurements that have arrived, each used at its stamp."""
     dropped: FloatArray
-    """Bound from the arrived measurements without those that arrived after a newer measurement."""
+    """Bound from the arrived measurements, except measurements that arrived after a newer measurement."""
 
 
 _NEVER_NS = np.iinfo(np.int64).max

@@ -30,7 +30,7 @@ class Matching:
     tracks: Columns
     """The r evaluated rows of tracks.csv, during the time with truth."""
     object_index: IntArray
-    """Object of each row, shape (r,); `NO_OBJECT` without one."""
+    """Index of the paired object of each row, shape (r,); `NO_OBJECT` if no object is paired."""
     true_states: FloatArray
     """x, y, yaw, speed and yaw rate of the row's object at the row's stamp, shape (r, 5).
 
@@ -48,7 +48,7 @@ class Matching:
     present: BoolArray
     """Mask of objects with truth at each tick, shape (ticks, objects)."""
     track_ids: IntArray
-    """Track of each object at each tick, shape (ticks, objects); `NO_TRACK` without one."""
+    """Track of each object at each tick, shape (ticks, objects); `NO_TRACK` if no track is paired."""
     in_view: BoolArray
     """Mask of objects that some sensor could detect, shape (ticks, objects), see `visible`."""
 
@@ -269,7 +269,7 @@ def confirmed(tracks: Columns) -> BoolArray:
 
 
 def published_rows(tracks: Columns, ticks: IntArray, track_ids: IntArray) -> IntArray:
-    """Row of `tracks` for each tick and track, shape (n,); -1 without one."""
+    """Return the row of `tracks` for each tick and track, shape (n,); -1 if the track was not published at the tick."""
     before, after = neighbours(tracks, "tick", ticks, track_ids)
     return np.where(before == after, before, -1)
 

@@ -75,7 +75,9 @@ def detections_in_map(run: Run) -> DetectionsInMap:
 
 
 def update_rows(run: Run) -> IntArray:
-    """Row of `Run.updates` for each row of `Run.detections`, shape (n,); -1 without one."""
+    """Return the row of `Run.updates` for each row of `Run.detections`, shape (n,); -1 for a detection without an
+    update.
+    """
     import pandas as pd
 
     frames = run.updates[_KEY], run.detections[_KEY]

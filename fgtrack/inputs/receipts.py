@@ -28,7 +28,7 @@ _Item = TypeVar("_Item")
 
 
 class _Sorter(Generic[_Item]):
-    """Sorts items into those whose receipts fit the others, and those with wrong receipts; see `sorted_out`."""
+    """Separates items with wrong receipts from the other items; see `sorted_out`."""
 
     def __init__(self) -> None:
         #: Items from the beginning, until there are enough of them to be certainly right.
@@ -134,7 +134,7 @@ def sorted_out(
 
 
 def with_right_receipts(path: Path, messages: Iterable[Message]) -> Iterator[Message]:
-    """Yield `messages` without those with wrong receipts (`sorted_out`).
+    """Yield the `messages` whose receipts are not wrong (`sorted_out`).
 
     The detections are counted in the next list of their sensor (`left_out`), and a
     warning counts all messages.

@@ -145,7 +145,7 @@ class BackwardForwardBank(Stateful):
         return states
 
     def steps_back(self, stamp_ns: int) -> int:
-        """Number of grid steps from the newest grid point back to the one nearest to `stamp_ns`.
+        """Number of grid steps from the newest grid point back to the grid point nearest to `stamp_ns`.
 
         The newer grid point is chosen on a tie. The number is 0 for a later stamp.
         """

@@ -105,7 +105,7 @@ class Coverage:
     persistence: Persistence | None = None
     """Persistence of the detections from list to list; None if too few recur."""
     disagreement_m: float | None = None
-    """Smallest standard deviation between positions of this sensor and of another one; None without common objects."""
+    """Smallest standard deviation between positions of this and another sensor; None without common objects."""
     unexplained_m: float = 0.0
     """Part of `disagreement_m` that the independent errors of both sensors do not explain."""
     area_m2: float | None = None

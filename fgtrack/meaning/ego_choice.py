@@ -56,7 +56,7 @@ class EgoConsistency:
 
     @property
     def is_consistent(self) -> bool:
-        """True if poses and speeds can be those of one vehicle."""
+        """True if poses and speeds are consistent: one vehicle can have both."""
         return self.misfit <= _TOLERANCE
 
 
@@ -100,7 +100,7 @@ def with_consistent_ego(
     """Return `parts` with the best ego before the other egos; `read` returns the states of a candidate.
 
     Poses that move as their speeds are better than poses that do not. Among these, fused
-    poses are better than those of wheels or of a single sensor; the order of `parts`
+    poses are better than poses from wheels or from a single sensor; the order of `parts`
     decides the rest.
     """
     egos = [part for part in parts if part.role == "ego"]

@@ -42,7 +42,7 @@ class FrameTest(NamedTuple):
 def frame_of(points: Points, motion: EgoMotion) -> FrameTest:
     """Test whether positions are in the map frame, or in the frame of the ego or of a sensor on it.
 
-    In the right frame objects keep their velocity for seconds. In the other one they
+    In the right frame objects keep their velocity for seconds. In the wrong frame they
     turn and accelerate with the ego. An ego on a straight road at constant speed
     decides nothing. Then the distances count: sensors detect objects near themselves.
     """

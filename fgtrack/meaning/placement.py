@@ -297,7 +297,10 @@ def _doubts(sample: Sample, mounts: Mounts, shown: Set[str]) -> dict[str, str]:
 def _doubt(
     sample: Sample, mounts: Mounts, members: Sequence[str], shown: Set[str]
 ) -> str | None:
-    """Return the reason against the assumption that the reference of `members` is in the ego's frame; None without."""
+    """Return the reason against the assumption that the reference of `members` is in the ego's frame.
+
+    None if no reason is against it.
+    """
     reference = mounts.references.get(members[0], members[0])
     others = [name for name in members if name != reference]
     off = [name for name in others if mounts[name].is_off]

@@ -81,7 +81,7 @@ class ConfigNoise:
 
     @property
     def stamp_stds(self) -> dict[str, float]:
-        """Configured standard deviations of stamps by sensor, where they are not 0."""
+        """Configured standard deviations of stamps by sensor. Sensors with exact stamps are left out."""
         return {
             name: item.stamp_std_s
             for name, item in self.config.used_sensors.items()
@@ -153,7 +153,7 @@ class TunedParameter:
     tuned: float
     """Fitted value; the configured value if the parameter is not identifiable."""
     std_error: float | None
-    """Standard error as a share of the value; None without one."""
+    """Standard error as a share of the value; None if the data do not determine the value."""
     known: Known
     """Identifiability of the parameter.
 

@@ -249,7 +249,7 @@ class _Tuning:
         return all_series, runs
 
     def _split_ns(self, tracks: Sequence[Series]) -> float:
-        """Return the stamp at which the held-out part of a recording begins; infinity without one."""
+        """Return the stamp at which the held-out part of a recording begins; infinity if no part is held out."""
         if self._rules.train_share == 1.0:
             return math.inf
         stamps_ns = [

@@ -153,7 +153,7 @@ def _outages(stamps_s: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _one_late(stamps_s: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Delays of 0 but for one measurement, which is 1 s late."""
+    """Return delays of 0, except one measurement that is 1 s late."""
     delays_s = np.zeros(len(stamps_s))
     delays_s[len(delays_s) // 2] = 1.0
     return delays_s

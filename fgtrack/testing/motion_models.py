@@ -131,7 +131,7 @@ def _run_equation(
 def _each_equal(
     values: FloatArray, expected: FloatArray, scale: FloatArray | float, what: str
 ) -> None:
-    """Require that each entry of `values` is that of `expected`, relative to its own size and its `scale`."""
+    """Require that each entry of `values` equals the entry of `expected`, relative to its own size and its `scale`."""
     require(
         np.shape(values) == expected.shape,
         f"{what} has shape {np.shape(values)}, expected {expected.shape}",

@@ -218,7 +218,7 @@ def initiated(
 
 
 class Initiated(Stateful):
-    """Wrapper that restarts an `Estimator` along its first positions until their direction is certain.
+    """Wrapper that restarts an `Estimator` along its first positions until the direction of travel is certain.
 
     The new estimator starts along the line, see `TrackInitiation.turned`. It fuses all measurements so far in the
     order of their stamps.

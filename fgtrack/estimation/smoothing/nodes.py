@@ -426,7 +426,9 @@ class Nodes(Stateful):
         self._share()
 
     def _take_numbers(self, tracks: IntArray, indices: IntArray) -> None:
-        """Give each of `tracks` (m,) a number for a further node, at the index in `indices` where it has none."""
+        """Give each of `tracks` (m,) a number for a further node, at its index in `indices` (m,), where it has no
+        number.
+        """
         first, end = self._num_numbers, self._num_numbers + len(tracks)
         if end > len(self.labels):
             self._resize(max(end, 2 * len(self.labels)), self.rows.shape[1])

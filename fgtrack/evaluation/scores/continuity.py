@@ -14,7 +14,8 @@ _SHORTEST_ABSENCE_NS = NS_PER_S
 def breaks(track_ids: IntArray) -> int:
     """Number of times that tracking resumes after a loss or with another track.
 
-    `track_ids` are the tracks at every tick with the object, `NO_TRACK` without one.
+    `track_ids` are the paired tracks at each tick at which the object is present;
+    `NO_TRACK` if no track is paired.
     """
     before = np.concatenate([[NO_TRACK], track_ids])[:-1]
     return max(int(((track_ids != NO_TRACK) & (track_ids != before)).sum()) - 1, 0)

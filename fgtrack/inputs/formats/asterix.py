@@ -483,7 +483,9 @@ def _velocity(
 
 
 def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
-    """Covariance of the measured components from the accuracy categories; None without a position accuracy."""
+    """Covariance of the measured components from the accuracy categories; None if the record has no position
+    accuracy.
+    """
     radius_m = _NACP_M.get(int(record.get("090/NACP", 0)))
     if not radius_m and record.get("210/VN") == 0:
         radius_m = _NUCP_M.get(int(record.get("090/NUCPNIC", 0)))

@@ -76,7 +76,7 @@ class RecordReader:
 def _read_numbers(
     end: _End, numbers: list[_Number], record: Record, block: bytes, at: int
 ) -> int:
-    """Add the `numbers` of an item to the record; arguments and result as of `_Item`."""
+    """Add the `numbers` of an item to the record. Arguments and result are those of `_Item`."""
     behind = end(block, at)
     for number in numbers:
         number.read(block[at:behind], record)

@@ -189,7 +189,9 @@ def items_by_fields(
 
 
 def _items_at(message: RosMessage, parts: Sequence[str]) -> list[RosMessage] | None:
-    """Items of the list at the path `parts`, and of all lists on the way; None without a list at its end."""
+    """Return the items of the list at the path `parts`, and of all lists on the path; None if the path ends at no
+    list.
+    """
     value = message
     for number, part in enumerate(parts):
         value = value_at(value, part)

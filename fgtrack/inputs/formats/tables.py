@@ -303,7 +303,7 @@ def _recognises(path: Path) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """Tables at `path`: the file, or those in the folder, by the ending of the name or by their content."""
+    """Return the tables at `path`: the file itself, or the files in the folder with a suitable name or content."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     usual = [file for file in files if file.name.endswith(_ENDINGS)]
     others = [file for file in files if file.suffix in _TEXT_ENDINGS and file.is_file()]

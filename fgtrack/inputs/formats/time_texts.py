@@ -104,7 +104,10 @@ def form_of(texts: Iterable[str]) -> TimeForm | None:
 
 
 def _times_ns(form: TimeForm, texts: Sequence[str]) -> list[int] | None:
-    """Times of `texts`, without those of another form; None if more than a tenth has another form."""
+    """Return the times of `texts` in the `form`, except texts in another form.
+
+    None if more than a tenth of the texts has another form.
+    """
     times_ns = list[int]()
     for number, text in enumerate(texts):
         try:

@@ -81,7 +81,7 @@ def settings_of(path: Path) -> Any:  # Any: validated by `fgtrack.config.recorde
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the bag files of a folder, also compressed ones and those of ROS 1, sorted by name."""
+    """Return the bag files of a folder, sorted by name. Compressed files and files of ROS 1 are included."""
     return sorted(
         file
         for file in path.iterdir()

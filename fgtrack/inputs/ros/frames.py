@@ -220,7 +220,7 @@ class BagFrames:
 
     @cached_property
     def _ego_message(self) -> object | None:
-        """First message of the ego; None without one."""
+        """First message of the ego; None if there is no ego, or no message."""
         if self._ego_topic is None:
             return None
         messages = self._bag.messages({self._ego_topic})

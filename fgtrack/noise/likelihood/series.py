@@ -154,7 +154,9 @@ class Series:
 
     @property
     def initiated_ns(self) -> int:
-        """Stamp of the last observation on the nominal trajectory; the stamp of the start without one."""
+        """Stamp of the last observation on the nominal trajectory; the stamp of the start if there is no such
+        observation.
+        """
         return (
             self.observations[self.num_initial - 1].measurement.stamp_ns
             if self.nominal

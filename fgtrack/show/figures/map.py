@@ -38,8 +38,8 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Ego, detections, tracks and truth on the map that `config.yaml` names in `map.track`, with a close-up.
 
     Truth is a broad pale line, so parts without a track remain visible. A track has the
-    colour of its true object, and is black without one. Without truth every confirmed
-    track has its own colour. The picture contains the map, the ego, the truth, and most
+    colour of its true object, and is black if it has no true object. Without truth
+    every confirmed track has its own colour. The picture contains the map, the ego, the truth, and most
     of the tracks and detections. The title counts those outside. The close-up shows the
     track with the most updates within 0.8 s. Raises `DataError` for an invalid
     `config.yaml`, or an invalid map.
@@ -139,7 +139,7 @@ class _Window(NamedTuple):
 def _window(run: Run) -> _Window | None:
     """Return the window around the track with the most updates within `_AROUND_S` of a stamp.
 
-    None without updates. If several stamps have as many updates, the first is used.
+    None if there are no updates. If several stamps have as many updates, the first is used.
     """
     used = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0)
     around_ns = nanoseconds(_AROUND_S)
