@@ -86,7 +86,7 @@ class _Sorter(Generic[_Item]):
 
     @property
     def _most(self) -> int:
-        """Largest number of successive items that may be wrong beside the items before."""
+        """Largest number of successive items that may be wrong; it grows with the number of right items before them."""
         return min(_MOST, self._num_near // _SHARE)
 
     def _decided(self) -> Iterator[tuple[_Item, bool]]:
@@ -104,7 +104,7 @@ class _Sorter(Generic[_Item]):
         yield from self._accept_far()
 
     def _accept_far(self) -> Iterator[tuple[_Item, bool]]:
-        """Yield the far items as right: the recording has a long pause, or its clock was set."""
+        """Yield the items with far receipts as right: the recording has a long pause, or its clock was set."""
         yield from self._release_head()
         yield from ((each, False) for each in self._far)
         self._far = []

@@ -46,7 +46,7 @@ _Message = TypeVar("_Message", bound=Message)
 
 
 class InvalidMessageError(Exception):
-    """Problem of a message; the reader adds the message's position."""
+    """Problem of a message; the reader adds the position of the message in the recording."""
 
 
 def validated(

@@ -136,7 +136,9 @@ class Assumed:
 
 
 def departures(value: object) -> Any:  # Any: plain values
-    """Plain values of `value`; fields of dataclasses are left out if they have the default, except `kind`."""
+    """Return `value` as plain values, without the fields of dataclasses that have their defaults. `kind` is always
+    kept.
+    """
     if isinstance(value, Mapping):
         return {name: departures(item) for name, item in value.items()}
     if not is_dataclass(value):

@@ -935,7 +935,10 @@ def _group_estimates(
 def _radial(
     table: _Table, poses: Sequence[Pose2], root: Pose2, motion: EgoMotion
 ) -> tuple[int, ...]:
-    """Return the indices of the sensors with a significant error along the sight: near sides of hulls, for instance."""
+    """Return the indices of the sensors with a significant position error along the line of sight.
+
+    Sensors that show the near sides of hulls are an example.
+    """
     count = len(poses)
     candidates = tuple(range(1, count))
     if not candidates:

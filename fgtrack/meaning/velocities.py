@@ -78,7 +78,7 @@ class VelocityMeaning:
 
     @property
     def component(self) -> str | None:
-        """Component of a detection for these values; None if no component takes them."""
+        """Name of the component of a detection that takes these values; None if no component takes them."""
         return None if self.kind is None else _COMPONENTS.get(self.kind)
 
     @property

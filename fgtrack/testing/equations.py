@@ -137,7 +137,7 @@ def _cv(model: CV) -> MotionEquation:
 
 
 def _with_errors(model: CorrelatedErrors) -> MotionEquation:
-    """The equation of the object, and of each error e with the correlation time T and the variance 1."""
+    """Return the equation of the object and of its errors e, which have correlation times T and variances 1."""
     base, n = equation_of(model.base), model.base.dim
     if base is None:
         raise CallError(f"the base of {model!r} has no entry in EQUATIONS")

@@ -115,10 +115,10 @@ def move_back(items: MapDetections, by_m: FloatArray) -> None:
 
 
 def merged(items: MapDetections, merge: "Merge") -> MapDetections:
-    """Return `items` with the detections of each object averaged, in the order of the merge; bearings alone are last.
+    """Return `items` in which the detections of each object are averaged.
 
-    The average has the components that all detections of the object have. If these give no position, the leading
-    detection represents the object.
+    The averages are in the order of the merge; detections with a bearing alone are last. An average has the components
+    that all detections of the object have. If these give no position, the leading detection represents the object.
     """
     bearing, apart = (
         np.isnan(items.points_m[:, 0]),
@@ -165,10 +165,11 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
 def covariances(
     items: MapDetections, k: int, rows: IntArray | slice, names: tuple[str, ...]
 ) -> FloatArray:
-    """Covariances of the components `names` in the map, shape (m, k, k), for the `rows` of `items` from one batch.
+    """Return the covariances of the components `names` in the map, shape (m, k, k), for `rows` of `items` from one
+    batch.
 
-    A detection's own covariance is used where it has one, else the sensor's R. A component from the map has the
-    sensor's standard deviation, without correlation. An average has the mean of the covariances of its detections.
+    The covariance of a detection has priority over the covariance R of the sensor. A component from the map has the
+    standard deviation of the sensor, without correlation. An average has the mean of the covariances of its detections.
     """
     (batch, sensor, _, pose), indices, points_m = (
         items.batches[k],
@@ -248,7 +249,7 @@ class PoseError(NamedTuple):
     covariance: FloatArray
     """Covariance of e, shape (5, 5)."""
     placement: FloatArray
-    """Derivative of z by the pose, shape (m, k, 5)."""
+    """Derivative by the pose of the detections z in the map, shape (m, k, 5)."""
     R: FloatArray
     """Covariances of the detections themselves, without e, shape (m, k, k)."""
 
@@ -259,7 +260,7 @@ class PoseError(NamedTuple):
     def noise(
         self, model: MeasurementModel, pose: SensorPose, x: FloatArray
     ) -> FloatArray:
-        """R + G P_e G' at the states `x` (m, n), shape (m, k, k)."""
+        """Return the covariances R + G P_e G' at the states `x` (m, n), shape (m, k, k)."""
         R, G = self.R.copy(), self.placement
         if model.relative:
             G = G - model.pose_jacobian(x, pose)
@@ -292,14 +293,14 @@ class Merge:
 
 @dataclass(frozen=True)
 class NoMerge(Merge):
-    """Every detection stands for itself."""
+    """Merges no detections: each detection is an object."""
 
     kind: Literal["none"] = "none"
 
 
 @dataclass(frozen=True)
 class ConnectedMerge(Merge):
-    """Joins detections that are linked by steps of at most a distance."""
+    """Merges detections that are linked by steps of at most a distance."""
 
     distance_m: float
     """Detections at most this far apart are linked."""

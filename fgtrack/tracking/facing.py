@@ -140,8 +140,10 @@ def read(
     limits: FloatArray,
     more: FloatArray | None = None,
 ) -> Readings:
-    """Return the readings of pairs of `members` (m,) of `group` and the tracks `columns` (m,) in these `states`.
-    `limits` (k + 1,) are the largest NIS by number of components, `more` (m,) is added to the NIS.
+    """Return the readings of pairs of `members` (m,) of `group` and the tracks `columns` (m,), which have these
+    `states`.
+
+    `limits` (k + 1,) are the largest NIS by number of components. `more` (m,) is added to the NIS.
     """
     own, kind = group.stack, _kind(group.stack.model.components)
     x = states.means.take(columns, axis=0)
@@ -173,7 +175,11 @@ def read(
 def as_read(
     measurements: Measurement, readings: IntArray
 ) -> list[tuple[IntArray | slice, Measurement]]:
-    """Return the stack `measurements` as read by its `readings` (m,), and the rows of each part."""
+    """Return the stack `measurements` as its `readings` (m,) interpret the yaws, in one or two parts, each with its
+    rows.
+
+    Measurements whose yaw is not used are a part without the yaw.
+    """
     if not readings.any():
         return [(slice(None), measurements)]
     names, z, R = (
@@ -263,7 +269,9 @@ class Facing(Stateful):
         )
 
     def _rows_of(self, track_ids: tuple[int, ...]) -> IntArray:
-        """Return rows of the arrays, shape (m,). The rows of the last call are kept for the same tracks."""
+        """Return the rows of tracks in the arrays, shape (m,). The last result is kept for a call with the same
+        tracks.
+        """
         if track_ids != self._last_ids:
             self._last_ids = track_ids
             self._last_rows = np.array(
@@ -312,9 +320,11 @@ class Facing(Stateful):
         found: Sequence[Readings],
         states: StatesAt,
     ) -> YawsRead | None:
-        """Return the likeliest readings of the assigned `pairs`, None where all are taken as they are.
-        The belief about the tracks and the shares of `sensor` learn from them. `found` are the readings of the pairs
-        that the association has compared; without them the `pairs` are read here.
+        """Return the likeliest readings of the assigned `pairs`; None if all yaws are used as measured and have no
+        defect.
+
+        The log-odds of the tracks and the shares of `sensor` learn from the readings. `found` are the readings of the
+        pairs that the association has compared. If they are empty, the `pairs` are read here.
         """
         if not any(map(is_read, candidates.groups)):
             return None
@@ -355,7 +365,7 @@ class Facing(Stateful):
         columns: IntArray,
         states: StatesAt,
     ) -> list[Readings]:
-        """Return the readings of candidates `rows` as those of the tracks `columns`, both (m,), without a gate."""
+        """Return the readings of candidates `rows` (m,) as detections of the tracks `columns` (m,), without a gate."""
         facings, result = self.at(sensor, states.track_ids), list[Readings]()
         for group, members, here in candidates.split(rows):
             if is_read(group):
@@ -374,7 +384,10 @@ class Facing(Stateful):
         evidence: FloatArray,
         has_yaw: bool,
     ) -> list[tuple[int, YawWord]]:
-        """Learn from readings (m,) of detections of the tracks in `rows`; return the yaws with a defect, and which."""
+        """Learn from readings (m,) of detections of the tracks in `rows`.
+
+        Returns the index and the defect of each yaw that has a defect.
+        """
         seen = self._seen.setdefault(sensor, np.zeros(3)) if has_yaw else np.zeros(3)
         arrays = self._log_odds, self._stamps_ns, seen
         self._least_log_odds = None

@@ -183,7 +183,10 @@ class GuardedBank(Stateful):
         track_ids: Sequence[int],
         measurements: Sequence[Measurement],
     ) -> Mapping[int, UpdateResult]:
-        """Return the results by track; tracks that raise end, unless their states are as before, and have none."""
+        """Return the results by track.
+
+        A track that raises ends and has no result. It does not end if its state is unchanged.
+        """
         try:
             results = self._bank.update(stamp_ns, track_ids, measurements)
         except EstimatorError as error:
@@ -291,8 +294,10 @@ class GuardedBank(Stateful):
         *,
         changes: bool = False,
     ) -> _T:
-        """Return the bank's answer to a question that raised `error`, when the tracks that prevent one have ended.
-        Raises `MemoryError` where there is not enough for the answer, unless the question `changes` states.
+        """Return the answer of the bank to a question that raised `error`, after the tracks that cause the error have
+        ended.
+
+        Raises `MemoryError` if the memory is not enough for the answer, unless the question `changes` states.
         """
         is_new = False
         while True:

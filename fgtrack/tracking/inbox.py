@@ -61,7 +61,10 @@ def record(
     innovation: FloatArray | None = None,
     yaw: YawWord | None = None,
 ) -> UpdateRecord:
-    """Return the record of detection `index` of `message`; the innovation is that of `measurement`, or one like it."""
+    """Return the record of detection `index` of `message`.
+
+    `innovation` is the innovation of `measurement`, or of a measurement with the same components.
+    """
     stamp_ns, named = message.objects[index].stamp_ns, dict[str, float]()
     if measurement is not None and innovation is not None:
         named = dict(
@@ -158,7 +161,7 @@ def is_usable(
 
 
 def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
-    """Covariance of the components `names` that `detection` carries, shape (k, k)."""
+    """Return the covariance of the components `names` that `detection` itself contains, shape (k, k)."""
     measured = detection.measured
     rows = [measured.index(name) for name in names]
     return np.array(detection.covariance).reshape(len(measured), len(measured))[
@@ -349,9 +352,9 @@ class Inbox(Stateful):
     def _is_heard(
         self, message: DetectionList, index: int, stamp_ns: int, pending: list[Batch]
     ) -> bool:
-        """True if another receiver has heard the message of detection `index`.
+        """True if another receiver has already received the message of detection `index`.
 
-        The earliest stamp in a tick counts: it replaces the stamp of the detection in `pending`.
+        The earliest stamp within a tick counts: it replaces the stamp of the detection in `pending`.
         """
         item, copies_s = message.objects[index], self._sensors[message.sensor].copies_s
         if item.id is None or not copies_s:
@@ -398,10 +401,10 @@ class Inbox(Stateful):
     def due(
         self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
     ) -> tuple[list[Batch], list[Batch]]:
-        """Return the pending batches that are ready, oldest stamp first, and those that stay pending.
+        """Return the pending batches that are ready, oldest stamp first, and the batches that stay pending.
 
-        `waits` is called for each batch at the tick `now_ns`. With a batch that waits, all batches of its message stay,
-        because a message misses tracks as a whole. Later batches of the same sensor stay as well.
+        `waits` returns True for a batch that waits at the tick `now_ns`. If a batch waits, all batches of its message
+        stay, because a message misses tracks as a whole. Later batches of the same sensor stay as well.
         """
         pending, held, first_ns = (
             sorted(self.pending, key=attrgetter("stamp_ns")),

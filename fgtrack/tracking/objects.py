@@ -194,9 +194,10 @@ class Objects(Stateful):
         return Evidence(classes, theirs, own, wrong_id_probability)
 
     def is_stray(self, detection: Detection, of: Hashable) -> bool:
-        """True if a track that does not match `detection` has its identity, unless three lists strayed just before.
-        A detection that far from the track of its identity is an outlier, not another object. The
-        list `of` the detection counts once: of several detections with one identity in a list, most must be wrong.
+        """True if `detection` is an outlier: a track that does not match it has its identity.
+
+        False if three lists had outliers with this identity just before. The list `of` the detection counts once: of
+        several detections with the same identity in a list, most must be wrong.
         """
         if detection.id is None or detection.id not in self._owners:
             return False
@@ -218,7 +219,9 @@ class Objects(Stateful):
     def apart(
         self, detections: Iterable[Detection], track_ids: Sequence[int]
     ) -> Apart | None:
-        """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
+        """Return a test of pairs of detections and tracks: True if their classes differ. None if no pair is
+        excluded.
+        """
         named = [each.class_name for each in detections]
         if not any(named):
             return None

@@ -61,7 +61,7 @@ class WindowedFilter(Stateful, ABC):
         )
 
     def moved_on(self, stamp_ns: int) -> UpdateStatus:
-        """Return the status of a fused measurement, and move the window to its stamp if it is the newest."""
+        """Return the status of a measurement that was fused at `stamp_ns`. A newest stamp also moves the window."""
         if stamp_ns < self._newest_ns:
             return UpdateStatus.OUT_OF_SEQUENCE
         self._newest_ns = stamp_ns

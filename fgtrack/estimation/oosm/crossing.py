@@ -75,7 +75,10 @@ class CrossingEkf(RewindForget):
     def _since(
         self, stamp_ns: int
     ) -> tuple[FloatArray, FloatArray, list[tuple[FilterStep, FloatArray]]]:
-        """Return x_{tau|m}, P_{tau|m}, and each step after `stamp_ns` with F (n, n) to it."""
+        """Return the predicted mean and covariance at `stamp_ns`, and each later step.
+
+        Each step comes with the Jacobian F (n, n) of the motion from the step before, or from the stamp.
+        """
         left = self._left(stamp_ns)
         mean, covariance = self._predicted(left, stamp_ns)
         since, x, at_ns = [], mean, stamp_ns

@@ -142,7 +142,7 @@ class Nodes(Stateful):
         self._share()
 
     def _share(self) -> None:
-        """Make the views of the arrays and their parts."""
+        """Assign the tuples of arrays that compiled loops take, and names for parts of the arrays."""
         n = self._motion.dim
         kept = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs)
         self.arrays = (*kept, self.points, self.blocks, self.rows)

@@ -105,7 +105,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
 
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:
-    """Return the errors of the final states, each against the object of its track at that stamp."""
+    """Return the errors of the final states. The truth is the object that was paired with the track at the stamp."""
     smoothed = run.tables["smoothed"]
     states, truth, rows = _with_truth(
         run, matching, smoothed.where(smoothed["kind"] == "final")

@@ -62,7 +62,9 @@ ToEgo = Callable[[RosMessage, int], Iterable[EgoState]]
 
 
 def computed_motion(topic: BagTopic, item: TopicInput) -> tuple[str, ...]:
-    """Return the components of the ego that follow from its successive poses, because the topic has none of them."""
+    """Return the components of the ego to compute from its successive poses, because the topic does not contain
+    them.
+    """
     if item.fields is not None:
         return missing_motion(item.fields)
     if topic.type in POSE_FIELDS:

@@ -55,7 +55,7 @@ class Durations(Stateful):
         self._limit_ns = None
 
     def usual_ns(self, most_ns: int = FOREVER) -> int | None:
-        """Return the longest usual duration of those up to `most_ns`; None if there are none."""
+        """Return the longest usual duration among the durations up to `most_ns`; None if all durations are longer."""
         if most_ns != self._limit_ns:
             ascending_ns = self._ascending_ns
             count = bisect_right(ascending_ns, most_ns)
@@ -126,9 +126,9 @@ class Delays(Stateful):
         self._processed_ns = max(self._processed_ns, stamp_ns)
 
     def usual_ns(self, most_ns: int = FOREVER) -> int:
-        """Return the longest usual delay up to `most_ns`; `most_ns` if all delays are longer.
+        """Return the longest usual delay among the delays up to `most_ns`; `most_ns` if all delays are longer.
 
-        The delay of the newest message counts as usual: a delay that has changed is followed at once.
+        The delay of the newest message counts as usual, so a changed delay takes effect at once.
         """
         usual_ns = self._recent.usual_ns(most_ns)
         if usual_ns is None:
@@ -141,9 +141,9 @@ class Delays(Stateful):
     def watermark_ns(self, now_ns: int, most_ns: int) -> int:
         """Return the stamp up to which all lists are processed, or should have come, at `now_ns`.
 
-        Lists should have come after their usual delay; those with delays above `most_ns` are not awaited. While no list
-        is overdue, by the usual time between two stamps, the newest processed stamp is the bound: there is no list
-        between it and the next one. `FOREVER` before the first message.
+        Lists should come within their usual delay. Lists with delays above `most_ns` are not awaited. While no list is
+        overdue, by the usual time between two stamps, the watermark is the newest processed stamp: no list lies between
+        this stamp and the next list. Returns `FOREVER` before the first message.
         """
         if not self._recent.arrived_ns:
             return FOREVER
@@ -180,8 +180,9 @@ class Watermarks(Stateful):
 
     def at(self, now_ns: int, oldest_ns: int) -> IntArray:
         """Return the watermark of each sensor at `now_ns`, shape (sensors,); see `Delays.watermark_ns`.
-        Lists before `oldest_ns` are too old for every track, and those after `max_delay_s` are refused: no track awaits
-        them.
+
+        No track awaits lists before `oldest_ns`, which are too old for every track, nor lists with a delay above
+        `max_delay_s`, which are refused.
         """
         reach_ns = now_ns - oldest_ns
         pairs = zip(self._of_sensors, self._limits_ns, strict=True)
