@@ -12,7 +12,7 @@ class MeasurementKeeper(Estimator, Protocol):
     """An estimator of one object that keeps the measurements of its window."""
 
     def has_fused(self, measurement: Measurement) -> bool:
-        """True if the window has an identical measurement."""
+        """True if the window contains an identical measurement."""
 
 
 class FusedOnce(Stateful):

@@ -32,9 +32,9 @@ _TAR = (257, b"ustar")
 
 
 def check_content(path: Path) -> None:
-    """Raise `DataError` if `path` has a form that would be mistaken for another one.
+    """Raise `DataError` if `path` has a form that looks like a form which fgtrack reads.
 
-    These are pointers of Git LFS, also in a folder, and annotations in OpenLABEL.
+    These forms are pointers of Git LFS, also in a folder, and annotations in OpenLABEL.
     """
     for file in _files(path):
         if file.stat().st_size > _LFS_BYTES:

@@ -273,7 +273,7 @@ def _by_lag(
 def _order(
     method: Method, problems: Sequence[Problem], found: Sequence[Answers]
 ) -> float:
-    """Largest change of the last answers if the arrivals come in another order; NaN without answers."""
+    """Return the largest change of the last answers in another order of arrival; NaN without answers."""
     largest = math.nan
     for number, problem in enumerate(problems[:_PERMUTED]):
         other = permuted(problem, np.random.default_rng(number))

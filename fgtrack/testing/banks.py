@@ -30,7 +30,7 @@ List = dict[int, Measurement]
 def gives_each_of_several_objects_what_it_gives_one_alone(
     subject: Subject, stream: Stream
 ) -> None:
-    """Require of each of several objects the results of an estimator that has this object alone.
+    """Require that each of several objects has the results of an estimator that has this object alone.
 
     Each list has a measurement of most objects. Half way through, an object is removed and a new object begins.
     """
@@ -93,7 +93,7 @@ def gives_each_of_several_objects_what_it_gives_one_alone(
 
 
 def _shifted(stream: Stream, number: int) -> Stream:
-    """Stream of another object, a little to the side."""
+    """Return the stream of another object, which is `number` times 0.36 m to the side."""
     shift = np.array([0.3, -0.2]) * number
     start: Start = replace(
         stream.start, position_m=tuple(np.add(stream.start.position_m, shift).tolist())
@@ -108,7 +108,9 @@ def _shifted(stream: Stream, number: int) -> Stream:
 def _alone(
     subject: Subject, own: Stream, number: int, lists: Sequence[List], begun: int
 ) -> tuple[Estimator, list[UpdateResult]]:
-    """Estimator of the object `number` alone, which begins with the list `begun`, and its results for `lists`."""
+    """Return an estimator of the object `number` alone, and its results for `lists`. It begins with the list
+    `begun`.
+    """
     estimator, results = subject.start(own), list[UpdateResult]()
     now_ns = own.start.stamp_ns
     for index, item in enumerate(lists):
@@ -146,7 +148,7 @@ def _same_results(
 
 
 def _known(state: TrackState, motion: MotionModel) -> TrackState:
-    """Entries of a kinematic state that `motion` estimates, without entries that are always 0."""
+    """Return the entries of a kinematic state that `motion` estimates, without entries that are always 0."""
     rows = [
         k
         for k, name in enumerate(STATE_NAMES[: len(state.mean)])

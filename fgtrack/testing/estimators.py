@@ -72,7 +72,10 @@ def _close(
     what: str,
     of_covariance: float = 0.0,
 ) -> None:
-    """Require that two states are as near in mean and covariance; `of_covariance` may be another tolerance."""
+    """Require that two states agree in mean and covariance within `tolerance`.
+
+    `of_covariance` is the tolerance of the covariance; 0 for the same `tolerance`.
+    """
     mean_sigma, covariance = difference(found, expected, stream.motion)
     at_s = (found.stamp_ns - stream.start.stamp_ns) / 1e9
     require(
@@ -152,7 +155,7 @@ def _tolerance(subject: Subject, stream: Stream) -> float:
 
 
 def _probes_ns(stream: Stream, oldest_ns: int = 0) -> list[int]:
-    """All stamps from `oldest_ns` on, those halfway between, and one ahead."""
+    """Return stamps for a comparison, from `oldest_ns` on: all stamps, the middles between them, and a later stamp."""
     stamps = stream.stamps_ns
     middles = [(a + b) // 2 for a, b in pairwise(stamps) if b - a >= MS]
     return [
@@ -208,7 +211,10 @@ def _gives_the_dense_joint_posterior_in_any_order(
 def _keeps_all_that_it_accepts_and_nothing_else(
     subject: Subject, stream: Stream
 ) -> None:
-    """The clock runs ahead of the stamps, and the window is shorter than the stream."""
+    """Require that measurements inside the window are fused, and that the states depend on these measurements alone.
+
+    The clock runs ahead of the stamps, and the window is shorter than the stream.
+    """
     estimator, accepted, newest_ns = (
         subject.start(stream),
         list[Measurement](),
@@ -328,7 +334,7 @@ def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> 
 
 
 def _counts_right_with(subject: Subject, stream: Stream, latency_ns: int) -> None:
-    """Require the right status of each measurement of a stream with this latency."""
+    """Require the expected status of each measurement of a stream with this latency."""
     estimator, newest_ns = subject.start(stream), stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
         stamp_ns, what = (
@@ -531,8 +537,10 @@ def _predicts_ahead_by_the_motion_model(subject: Subject, stream: Stream) -> Non
 
 
 def _gives_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Stream) -> None:
-    """In the order of the stamps: an extended Kalman filter, an iterated one, or least squares over all states.
-    Noise, Jacobians, the pose and motion of sensors, angles and losses all count there.
+    """Compare the states with a plain calculation, for measurements in the order of their stamps.
+
+    The calculation is an extended Kalman filter, an iterated filter, or least squares over all states. It shows errors
+    in noise, Jacobians, poses and motion of sensors, angles and losses.
     """
     estimator, claims = subject.fed(stream)[0], subject.claims
     repeats = _converged(subject, estimator) or claims.iterates
@@ -554,7 +562,7 @@ def _gives_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Stream) 
 def _converged(
     subject: Subject, *estimators: Any
 ) -> bool:  # Any: the claim promises `converge`
-    """True if the estimators have to converge first, which they do."""
+    """Call `converge` of `estimators` if their claims need it. Return True if it was called."""
     needed = subject.claims.nonlinear == "at convergence"
     for estimator in estimators if needed else ():
         getattr(estimator, "bank", estimator).converge()
@@ -672,7 +680,7 @@ def estimator_checks(
     num_streams: int = 10,
     **options: Any,
 ) -> dict[str, Callable[[], None]]:
-    """Checks of `check_estimator` one by one, by name of the promise, for `pytest.mark.parametrize`."""
+    """Return the checks of `check_estimator` by name of the promise, for `pytest.mark.parametrize`."""
     made = ESTIMATORS.load(factory) if isinstance(factory, str) else factory
     claims = Claims.of(made)
     if exact is not None:

@@ -37,9 +37,9 @@ _ENTRY_TOLERANCE = 1e-7
 def check_motion_model(
     model: MotionModel, seed: int = 0, equation: MotionEquation | None = None
 ) -> None:
-    """Raise `BrokenPromiseError` unless `model` keeps the contract, with the state and duration that show it.
+    """Raise `BrokenPromiseError` unless `model` keeps the contract. The error contains the state and the duration.
 
-    With an `equation`, mean, Jacobian and noise must also be those of the stochastic differential equation. A shipped
+    With an `equation`, mean, Jacobian and noise must also agree with the stochastic differential equation. A shipped
     model has an equation of its own.
     """
     run_all(repr(model), motion_model_checks(model, seed, equation))
@@ -48,7 +48,7 @@ def check_motion_model(
 def motion_model_checks(
     model: MotionModel, seed: int = 0, equation: MotionEquation | None = None
 ) -> dict[str, Callable[[], None]]:
-    """The checks of `check_motion_model` one by one, by name of the promise: for `pytest.mark.parametrize`."""
+    """Return the checks of `check_motion_model` by name of the promise, for `pytest.mark.parametrize`."""
     checks: dict[str, Callable[[], None]] = {
         _name(check): partial(_run, _name(check), check, model, seed)
         for check in _CHECKS
@@ -79,7 +79,7 @@ def _run(name: str, check: ModelCheck, model: MotionModel, seed: int) -> None:
 
 
 def _cases(model: MotionModel, seed: int) -> list[tuple[FloatArray, float]]:
-    """Random states (n,) of a model, with durations."""
+    """Return random states (n,) of a model, with durations."""
     rng, cases = np.random.default_rng(seed), list[tuple[FloatArray, float]]()
     for number in range(_NUM_STATES):
         kinematic = rng.normal(size=6) * [50.0, 50.0, 2.0, 20.0, 0.3, 2.0]
@@ -164,7 +164,10 @@ def _has_the_jacobian_of_its_equation(cases: _EquationCases, case: int) -> None:
 
 
 def _has_the_noise_of_its_equation(cases: _EquationCases, case: int) -> None:
-    """Composition does not show the density: a density that is 10 % off composes perfectly."""
+    """Check the process noise against the noise of the equation.
+
+    A check of composition is not enough: a noise density that is 10 % off composes perfectly.
+    """
     x, dt_s = cases.states
     expected = cases.expected.Q[case]
     sigma = np.sqrt(np.diag(expected))
@@ -179,7 +182,7 @@ def _has_the_noise_of_its_equation(cases: _EquationCases, case: int) -> None:
 def _moves_in_compiled_loops_as_by_its_equation(
     cases: _EquationCases, case: int
 ) -> None:
-    """Compiled filters take the transition without a call of the model."""
+    """Check the prediction of compiled loops, which do not call the model."""
     model, (x, dt_s) = cases.model, cases.states
     assert isinstance(model, WhiteNoise)  # the only models that compiled loops take
     mean, P = x[case][None].copy(), np.diag(1.0 + np.arange(model.dim))[None]
@@ -199,7 +202,7 @@ def _moves_in_compiled_loops_as_by_its_equation(
 def _equal(
     values: FloatArray, expected: FloatArray, tolerance: float, what: str
 ) -> None:
-    """Require that `values` are `expected`; a NaN is not."""
+    """Require that `values` equals `expected` within `tolerance`; NaN never does."""
     values = np.asarray(values)
     require(
         values.shape == expected.shape,
@@ -284,7 +287,10 @@ def _refuses_noise_of_a_negative_duration(
 def _has_the_transition_of_its_functions(
     model: MotionModel, x: FloatArray, dt_s: float
 ) -> None:
-    """Check one state and several numbers of states, each with another duration."""
+    """Check that `transition` equals `predict`, `jacobian` and `process_noise`.
+
+    The states are one state, and several numbers of states, each with another duration.
+    """
     counts = 1, 2, 3, 24
     cases: list[tuple[FloatArray, float | FloatArray]] = [(x, dt_s)]
     cases += [
@@ -335,7 +341,7 @@ def _keeps_its_inputs(model: MotionModel, x: FloatArray, dt_s: float) -> None:
 
 
 def _shown(model: MotionModel, x: FloatArray) -> FloatArray:
-    """The kinematic state of `x` (n,), by the names of its entries."""
+    """Return the kinematic state of the state `x` (n,), whose entries are selected by name."""
     own = dict(zip(model.state_names, x.tolist(), strict=True))
     if model.cartesian:
         own["yaw_rad"], own["speed_mps"] = (
@@ -347,7 +353,7 @@ def _shown(model: MotionModel, x: FloatArray) -> FloatArray:
 
 
 def _covariance(n: int) -> FloatArray:
-    """A covariance whose entries are all different, shape (n, n)."""
+    """Return a covariance whose entries are all different, shape (n, n)."""
     root = np.eye(n) + 0.3 * np.sin(np.arange(n * n, dtype=np.float64)).reshape(n, n)
     return _SMALL * root @ root.T
 
@@ -355,7 +361,10 @@ def _covariance(n: int) -> FloatArray:
 def _publishes_the_entries_of_its_state(
     model: MotionModel, x: FloatArray, dt_s: float
 ) -> None:
-    """The mean by name, the covariance by difference quotients of that."""
+    """Check that the mean of `kinematic` has the entries of the state by name.
+
+    The covariance is checked with difference quotients of the mean.
+    """
     P, J = _covariance(model.dim), slope(lambda state: _shown(model, state), x)
     mean, covariance = model.kinematic(x, P)
     many, covariances = model.kinematic(np.stack([x, 1.1 * x]), np.stack([P, 2.0 * P]))
@@ -383,7 +392,10 @@ def _publishes_the_entries_of_its_state(
 def _is_as_it_was_after_a_kinematic_state(
     model: MotionModel, x: FloatArray, dt_s: float
 ) -> None:
-    """The mean; and, because the errors are small, the covariance of the components of both."""
+    """Check that `from_kinematic` of `kinematic` returns the mean, and the covariance of the common entries.
+
+    The covariance is that of small errors, because both functions are nonlinear.
+    """
     P = _covariance(model.dim)
     shown, published = model.kinematic(x, P)
     back, covariance = model.from_kinematic(shown, published)
@@ -405,7 +417,10 @@ def _is_as_it_was_after_a_kinematic_state(
 def _begins_with_a_sound_covariance(
     model: MotionModel, x: FloatArray, dt_s: float
 ) -> None:
-    """An entry of which nothing is known begins at 0 with its own variance."""
+    """Check that an unobserved entry of a new state has the mean 0 and the variance `start_variance`.
+
+    The covariance must be symmetric and positive definite.
+    """
     for name in model.state_names:
         variance = model.start_variance(name)
         require(

@@ -38,7 +38,7 @@ def run_all(what: str, checks: Mapping[str, Callable[[], None]]) -> None:
 
 
 class WrongError(Exception):
-    """Fault of an estimator; the runner adds the measurements."""
+    """Fault of an estimator. The runner adds the measurements that show the fault."""
 
 
 def require(condition: object, text: str) -> None:
@@ -85,13 +85,13 @@ class Subject:
     options: Mapping[str, Any]
 
     def start(self, stream: Stream) -> Estimator:
-        """New estimator of the object of `stream`."""
+        """Return a new estimator of the object of `stream`."""
         return start_estimator(
             self.name, self.factory, stream.motion, stream.start, LAG_S, self.options
         )
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
-        """New estimator that has fused all of `stream`, and the results."""
+        """Return a new estimator that has fused all measurements of `stream`, and the results."""
         estimator = self.start(stream)
         return estimator, [
             estimator.update(measurement) for measurement in stream.measurements

@@ -140,7 +140,7 @@ def kalman_filter(
 
 
 def predicted(motion: MotionModel, state: TrackState, stamp_ns: int) -> TrackState:
-    """The state (n,) moved on to `stamp_ns`. Raises `CallError` for a motion model without an equation."""
+    """Return the state at `stamp_ns`, predicted. Raises `CallError` for a motion model without an equation."""
     ahead = _moments(
         motion, state.mean[None], np.array([seconds(stamp_ns - state.stamp_ns)])
     )
@@ -151,11 +151,7 @@ def predicted(motion: MotionModel, state: TrackState, stamp_ns: int) -> TrackSta
 def _updated(
     motion: MotionModel, x: FloatArray, P: FloatArray, item: Measurement, iterated: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """State x (n,) and covariance P (n, n) after the measurement.
-
-    The step s minimises the prior cost plus the loss of y - H s, by reweighting. The `iterated` update repeats it about
-    x + s, with the innovation there, until the step no longer changes.
-    """
+    """Return the state x (n,) and its covariance P (n, n) after the measurement."""
     step = np.zeros(len(x))
     for _ in range(_NEWTON_STEPS if iterated else 1):
         y, H = innovation(motion, item, x + step)
