@@ -69,6 +69,8 @@ _SURE = 0.0005
 _SMALLEST_RAD = 0.005
 _SMALLEST_M = 0.1
 _KNOWN_YAW_RAD = 0.05
+#: Difference from the assumed yaw from which few still objects speak against it.
+_CONTRARY_RAD = 0.1
 
 
 class Pose2(NamedTuple):
@@ -121,6 +123,8 @@ class MountEstimate:
     """A line on the data behind the estimate, or the reason why there is no estimate."""
     is_off: bool = False
     """True if the mount differs from the assumed one significantly (99.9 %), and enough to matter."""
+    contrary_yaw_rad: float | None = None
+    """Yaw at which an object stands still, against the assumed yaw; too few objects for an estimate."""
 
     @property
     def pose(self) -> Pose2:
@@ -677,6 +681,8 @@ class _Solution(NamedTuple):
     dof: FloatArray
     still: int
     """Number of objects that stand still."""
+    contrary_yaw_rad: float | None = None
+    """Yaw of the reference at which few objects stand still, against its assumed yaw."""
 
 
 class _Free(NamedTuple):
@@ -754,13 +760,16 @@ def _still(table: _Table, velocities_mps: FloatArray) -> BoolArray:
 
 def _turn_of_still(
     table: _Table, velocities_mps: FloatArray, motion: EgoMotion
-) -> tuple[float, int]:
-    """Return the yaw by which the reference must turn so that most objects stand still, and their number of runs.
+) -> float:
+    """Return the yaw by which the reference must turn so that most detections are of objects that stand still.
 
-    `velocities_mps` are those of the runs in the map, for the assumed mount.
+    `velocities_mps` are those of the runs in the map, for the assumed mount. Short runs
+    do not count, because they hardly show a velocity.
     """
-    ends = np.append(np.flatnonzero(np.diff(table.runs)), len(table.runs) - 1)
+    starts = np.flatnonzero(np.diff(table.runs, prepend=-1))
+    ends = np.append(starts[1:], len(table.runs)) - 1
     times_s = table.times_s[ends]
+    counts = ends - starts + 1
     span = np.array([-0.5, 0.5])
     at_m = [motion.poses(times_s + shift)[:, :2] for shift in span]
     ego_mps = (at_m[1] - at_m[0]) / np.ptp(span)
@@ -768,20 +777,21 @@ def _turn_of_still(
     speeds_mps = np.hypot(*ego_mps.T)
     gaps_mps = np.abs(np.hypot(*relative_mps.T) - speeds_mps)
     usable = (speeds_mps > _SLOWEST_EGO_MPS) & (gaps_mps < _STILL_MPS)
+    usable &= times_s - table.times_s[starts] > _SHORTEST_STILL_S
     if not usable.any():
-        return 0.0, 0
+        return 0.0
+    counts = counts[usable]
     turn = np.arctan2(*-ego_mps[usable].T[::-1]) - np.arctan2(
         *relative_mps[usable].T[::-1]
     )
     near = np.cos(turn[:, None] - _YAWS_RAD) > math.cos(2.0 * _STEP_RAD)
-    votes = near.sum(axis=0)
-    zero = int((np.cos(turn) > math.cos(2.0 * _STEP_RAD)).sum())
+    votes = counts @ near
+    zero = int(counts[np.cos(turn) > math.cos(2.0 * _STEP_RAD)].sum())
     if 2 * zero >= votes.max():
-        return 0.0, zero
-    chosen = turn[near[:, int(votes.argmax())]]
-    return math.atan2(float(np.sin(chosen).sum()), float(np.cos(chosen).sum())), int(
-        votes.max()
-    )
+        return 0.0
+    chosen = near[:, int(votes.argmax())]
+    x, y = counts[chosen] @ np.cos(turn[chosen]), counts[chosen] @ np.sin(turn[chosen])
+    return math.atan2(float(y), float(x))
 
 
 _System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -923,11 +933,17 @@ def _group_estimates(
                 if best.still
                 else "no object that stands still shows it"
             )
+            if best.contrary_yaw_rad is not None:
+                yaw_deg = math.degrees(best.contrary_yaw_rad)
+                why = f"an object stands still if its axis is at {yaw_deg:.0f} degrees, not ahead"
         elif radial:
             why += ", with an error along the sight"
         stds = tuple(best.stds[3 * k : 3 * k + 3].tolist())
         dof = tuple(best.dof[3 * k : 3 * k + 3].tolist())
-        item = MountEstimate(name, *pose, stds, dof, count, why)
+        contrary_rad = None if k else best.contrary_yaw_rad
+        item = MountEstimate(
+            name, *pose, stds, dof, count, why, contrary_yaw_rad=contrary_rad
+        )
         result.append(item.judged(assumed.get(name, Pose2())))
     return result
 
@@ -962,9 +978,11 @@ def _with_root(
     """Return the solution with the mount of the reference that still objects show, as far as it is significant."""
     rows = _rows(table, base.poses, root, np.zeros(len(table.runs), dtype=bool), ())
     velocities_mps = filtered(rows).velocities_mps
-    turn_rad, _ = _turn_of_still(table, velocities_mps, motion)
+    turn_rad = _turn_of_still(table, velocities_mps, motion)
     turned = Pose2(wrap_angle(root.yaw_rad + turn_rad), root.x_m, root.y_m)
     result = base
+    is_shown = False
+    still = 0
     for which in ((True, False, False), (True, True, True)):
         fit = _solved(table, base.poses, turned, _Free(which, radial), motion)
         d = np.array(
@@ -977,15 +995,18 @@ def _with_root(
         sure = _is_significant(d, fit.stds[:3], fit.dof[:3])
         if which[1] and not sure[1:].any():
             continue
+        still = max(still, fit.still)
         if sure.any():
             result = fit
+            is_shown = True
         elif not which[1] and fit.dof[0] >= _FEWEST_DOF:
             result = result._replace(
                 still=fit.still,
                 stds=np.concatenate([fit.stds[:1], base.stds[1:]]),
                 dof=np.concatenate([fit.dof[:1], base.dof[1:]]),
             )
-    return result
+    is_contrary = not is_shown and still > 0 and abs(turn_rad) > _CONTRARY_RAD
+    return result._replace(contrary_yaw_rad=turned.yaw_rad if is_contrary else None)
 
 
 def _is_significant(d: FloatArray, stds: FloatArray, dof: FloatArray) -> BoolArray:

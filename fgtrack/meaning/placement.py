@@ -230,10 +230,14 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     """Yield a decision on the mount of each sensor on the ego.
 
     The mount is estimated, or assumed if it is not observable. The decision stays open in
-    three cases: the header frame is unknown and no test shows the yaw of the sensor; the
-    sensor measures ranges and bearings beside other sensors, and nothing shows its mount;
-    positions of sensors are in different frames, and nothing shows which frame is the
-    ego's. A single sensor, or sensors that agree, may be assumed in the ego.
+    four cases:
+
+    - the header frame is unknown, and no test shows the yaw of the sensor;
+    - the sensor measures ranges and bearings beside other sensors, and nothing shows its mount;
+    - positions of sensors are in different frames, and nothing shows which frame is the ego's;
+    - an object stands still at another yaw than the assumed one.
+
+    A single sensor, or sensors that agree, may be assumed in the ego.
     """
     paths = {
         name: path
@@ -302,6 +306,11 @@ def _doubt(
     None if no reason is against it.
     """
     reference = mounts.references.get(members[0], members[0])
+    root = mounts[reference]
+    if root.contrary_yaw_rad is not None:
+        return f"{reference}: {root.why}; too few objects confirm it"
+    if root.is_off:
+        return f"the yaw of {reference} is known too roughly: {root.words}"
     others = [name for name in members if name != reference]
     off = [name for name in others if mounts[name].is_off]
     against = "; ".join(f"against {reference}, {mounts[name]}" for name in off)

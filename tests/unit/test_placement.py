@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from fgtrack.config.settings import Config
 from fgtrack.core.types import DetectionList
 from fgtrack.meaning.decision import Decision
@@ -100,3 +102,25 @@ def test_radars_in_different_axes_are_asked_for_together() -> None:
     left = Sensor("left", 0.8, 2.0, 1.0, half_view_rad=1.3, clutter=0.2)
     found = decisions(2, front, left, **MOVING)
     assert {item.certainty for item in found.values()} == {"open"}
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_one_still_object_contradicts_the_assumed_yaw(seed: int) -> None:
+    lone = Sensor("radar", 0.8, half_view_rad=1.3)
+    found = decisions(seed, lone, parked=1)
+    assert found["radar"].certainty == "open"
+    yaw_deg = float(str(found["radar"].reason).split(" is at ")[1].split()[0])
+    assert yaw_deg == pytest.approx(math.degrees(0.8), abs=3.0)
+
+
+def test_one_still_object_confirms_the_assumed_yaw() -> None:
+    lone = Sensor("radar", half_view_rad=1.3)
+    assert decisions(1, lone, parked=1)["radar"].certainty == "assumed"
+
+
+def test_sensors_that_agree_on_a_turned_axis_are_asked_for() -> None:
+    top = Sensor("top", math.pi / 2, form="sensor", half_view_rad=math.pi, clutter=0.2)
+    radar = Sensor("radar", 0.0, 3.0, half_view_rad=0.9, clutter=0.2)
+    found = decisions(1, top, radar, parked=1)
+    assert {item.certainty for item in found.values()} == {"open"}
+    assert "top: an object stands still if its axis is at 9" in found["top"].reason
