@@ -174,7 +174,7 @@ def estimator(
     ):
         if not isinstance(value, kind):
             raise CallError(
-                f"argument {what}: must be a {kind.__name__}, is a {type(value).__name__}"
+                f"{what}: must be a {kind.__name__}, is a {type(value).__name__}"
             )
     if not is_number(lag_s, 0.0):
         raise CallError(
