@@ -387,9 +387,14 @@ def _tracks(evidence: Evidence) -> Iterator[Check]:
         )
     else:
         truth = outcome.truth
-        rmse_m = truth.errors["position_m"].rmse
+        errors_m = truth.errors["position_m"]
+        size = (
+            f"position RMSE {errors_m.rmse:.3g} m"
+            if errors_m.count
+            else "no track to measure a position error of"
+        )
         share = percent(truth.tracked_share_in_view)
-        text = f"{share} of the time in view tracked (limit {percent(_LEAST_TRACKED)}), position RMSE {rmse_m:.3g} m"
+        text = f"{share} of the time in view tracked (limit {percent(_LEAST_TRACKED)}), {size}"
         is_fine = truth.tracked_share_in_view >= _LEAST_TRACKED and not is_found
         yield _unless(doubt, Check(TRACKS, "truth", _verdict(is_fine), text))
 
