@@ -27,12 +27,13 @@ def test_a_sweep_is_drawn_by_its_folder(
     sweep = str(a_sweep(tmp_path / "sweep"))
     assert command(["figure", sweep, "-o", str(tmp_path / "few")]) == 0
     assert "1 more figures with --all" in capsys.readouterr().out
-    assert [file.name for file in (tmp_path / "few").iterdir()] == [
-        "sweep_truth.overall.errors.position_m.rmse.png"
+    assert sorted(file.name for file in (tmp_path / "few").iterdir()) == [
+        "error_against_delay.png",
+        "sweep_truth.overall.errors.position_m.rmse.png",
     ]
     assert command(["figure", sweep, "-o", str(tmp_path / "all.pdf"), "--all"]) == 0
     assert "more with" not in capsys.readouterr().out
-    assert (tmp_path / "all.pdf").read_bytes().count(b"/Type /Page ") == 2
+    assert (tmp_path / "all.pdf").read_bytes().count(b"/Type /Page ") == 3
 
 
 def test_a_sweep_is_drawn_alone(
