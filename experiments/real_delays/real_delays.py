@@ -28,7 +28,6 @@ from fgtrack import (
     FloatArray,
     Message,
     TrackStatus,
-    open_input,
 )
 from fgtrack.evaluation import paired
 from fgtrack.inputs.errors import UntilBreak
@@ -136,10 +135,9 @@ class Judge:
 
 def read(recording: Recording, data: Path) -> tuple[list[Message], Config]:
     config = Config.from_yaml(recording.config).replace(recording.settings)
+    draft = fgtrack.draft(data / recording.path, config)
     messages: list[Message] = []
-    for message in UntilBreak(
-        open_input(data / recording.path, config.input).messages()
-    ):
+    for message in UntilBreak(draft.source.messages()):
         if isinstance(message, DetectionList):
             if (
                 messages
@@ -148,7 +146,7 @@ def read(recording: Recording, data: Path) -> tuple[list[Message], Config]:
             ):
                 break
             messages.append(message)
-    return messages, config
+    return messages, draft.config
 
 
 def track(
@@ -284,9 +282,9 @@ def policies(
 
 def horizon(data: Path) -> Iterator[dict[str, object]]:
     """Windows of a filter for a car whose reports come in bursts."""
-    recording = Recording(CAR, "v2x", 0.5)
     for horizon_s in HORIZONS_S:
-        config = Config.from_yaml("v2x").replace({"filter.storage_s": horizon_s})
+        settings = {"filter.storage_s": horizon_s}
+        messages, config = read(Recording(CAR, "v2x", 0.5, settings=settings), data)
         run = fgtrack.replay(data / CAR, config)
         counts = dict(
             zip(
@@ -294,7 +292,6 @@ def horizon(data: Path) -> Iterator[dict[str, object]]:
                 strict=True,
             )
         )
-        messages, _ = read(recording, data)
         rows = pd.DataFrame(
             track(messages, config, Judge(messages, 0.5), ticks_of(messages, config))
         )
