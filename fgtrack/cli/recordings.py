@@ -27,7 +27,6 @@ from fgtrack.core.output import check_no_overlap
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.inputs.recording import check_recording, write_recording
-from fgtrack.meaning.draft import opened
 from fgtrack.sim.new_delays import SensorDelays, redelay
 from fgtrack.sim.simulate import simulate as simulated
 
@@ -80,6 +79,8 @@ def convert(
     config = read_config(config_file)
     check_no_overlap(out, [recording, config_file, delays_file])
     check_recording(out, overwrite)
+    from fgtrack.meaning.draft import opened
+
     source = opened(recording, config).source
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):

@@ -15,8 +15,6 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.types import EgoState, Message
 from fgtrack.inputs.formats.native import NATIVE_ADAPTERS
 from fgtrack.inputs.formats.tables import headers
-from fgtrack.inputs.info import describe
-from fgtrack.inputs.ros.bag import Bag
 from fgtrack.inputs.settings import CsvInput, CsvTable, InputConfig, TopicInput
 from fgtrack.inputs.source import InputSource, input_kind, open_input
 from fgtrack.meaning.assumed import assumed, unmodelled_sensors
@@ -28,7 +26,6 @@ from fgtrack.meaning.guess import words_of
 from fgtrack.meaning.parts import EGO_WORDS, InputPart
 from fgtrack.meaning.reports import report_part
 from fgtrack.meaning.tables import table_part
-from fgtrack.meaning.topics import topic_part
 
 __all__ = ["Draft", "drafted", "opened", "opened_together"]
 
@@ -305,6 +302,11 @@ def _parts(recording: Path, kind: str) -> tuple[list[InputPart], list[str]]:
         for file, columns in headers(recording).items():
             makers[file.name] = partial(table_part, file, columns, is_folder, parts)
     else:
+        # Readers of bags are imported for bags alone.
+        from fgtrack.inputs.info import describe
+        from fgtrack.inputs.ros.bag import Bag
+        from fgtrack.meaning.topics import topic_part
+
         result = describe(recording)
         refused += [] if result.problem is None else [result.problem]
         if not any(topic.type in NATIVE_ADAPTERS for topic in result.topics):

@@ -3,20 +3,23 @@
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fgtrack.config.settings import Config
 from fgtrack.core.types import DetectionList, FloatArray, Message
 from fgtrack.inputs.geodetic import GEODETIC
-from fgtrack.inputs.ros.bag import Bag
-from fgtrack.inputs.ros.frames import BagFrames, FrameUse
 from fgtrack.inputs.settings import CsvTable, InputConfig, TopicInput
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.frames import FrameTest, frame_of, is_optical
 from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
 from fgtrack.meaning.sample import Sample
 from fgtrack.meaning.tracklets import Points, points_of
+
+if TYPE_CHECKING:
+    from fgtrack.inputs.ros.bag import Bag
+    from fgtrack.inputs.ros.frames import BagFrames, FrameUse
 
 __all__ = ["frame_decisions", "mount_decisions", "mounts_of", "plain_mount"]
 
@@ -71,8 +74,12 @@ class _HeaderFrames:
 
     def of(
         self, name: str
-    ) -> tuple[str, FrameUse, tuple[float, float, float] | None] | None:
+    ) -> "tuple[str, FrameUse, tuple[float, float, float] | None] | None":
         """Return the header frame of a sensor, its use, and its mount by tf; None without a header."""
+        # Readers of bags are imported for bags alone.
+        from fgtrack.inputs.ros.bag import Bag
+        from fgtrack.inputs.ros.frames import BagFrames
+
         inputs = self._sample.config.input
         if self._bag is None:
             self._bag = Bag(self._sample.path, inputs.message_definitions)
