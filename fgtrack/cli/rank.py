@@ -9,7 +9,7 @@ from typer import Argument, Option
 from fgtrack.cli.arguments import FormOption, Overwrite, Seed
 from fgtrack.cli.show import progress, say, sentences, show
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.output import new_files
+from fgtrack.core.output import check_output, new_files
 from fgtrack.evaluation.tables import Tables
 from fgtrack.ranking.files import write_exact, write_problem
 from fgtrack.ranking.judge import Ranking
@@ -49,14 +49,17 @@ def rank(
     The answers are compared with the truth and with the exact joint estimate.
     """
     names = list(dict.fromkeys(scenarios or SCENARIOS))
+    if not methods and export is None:
+        raise CallError("give at least one METHOD, or --export FOLDER")
+    chosen = [method(text) for text in methods or ()]
+    for path in _outputs(out, [each.name for each in chosen]):
+        check_output(path, overwrite)
     if export is not None:
-        _export(export, names, seed, overwrite)
-    if not methods:
-        if export is None:
-            raise CallError("give at least one METHOD, or --export FOLDER")
+        for name in names:
+            _export(export / name, name, seed, overwrite)
+    if not chosen:
         return
-    chosen = [method(text) for text in methods]
-    with progress("rank", len(chosen) * len(names)) as step:
+    with progress("rank") as step:
         found = ranked(chosen, names, num_runs=runs, seed=seed, on_step=step)
     tables = Tables({table.title: table for table in found.tables()})
     show(tables, form)
@@ -90,11 +93,17 @@ def _write(
             )
 
 
-def _export(export: Path, names: list[str], seed: int, overwrite: bool) -> None:
-    """Write measurements, truth and exact states of each scenario into a folder of its name."""
-    with new_files(export, overwrite) as folder:
-        for name in names:
-            problem = draw(name, seed)
-            (folder / name).mkdir()
-            write_problem(folder / name, problem)
-            write_exact(folder / name, problem)
+def _outputs(out: Path | None, names: list[str]) -> list[Path]:
+    """Return the files that a ranking of the methods `names` writes into `out`."""
+    if out is None:
+        return []
+    tables = [out / f"ranking.{ending}" for ending in ("md", "tex", "json")]
+    return [*tables, *(out / f"{name}.md" for name in names)]
+
+
+def _export(folder: Path, name: str, seed: int, overwrite: bool) -> None:
+    """Write measurements, truth and exact states of the scenario `name` into a folder."""
+    with new_files(folder, overwrite) as into:
+        problem = draw(name, seed)
+        write_problem(into, problem)
+        write_exact(into, problem)

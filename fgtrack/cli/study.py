@@ -60,7 +60,7 @@ def study(
     settings: Settings = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Find out what a recording means, replay it with three estimators, compare, report.
+    """Read a recording, replay three estimators, compare, report.
 
     No configuration is needed. Assumptions are printed with their reasons, and written
     to settings.yaml. Change this file and run the command again. The settings hold for

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from fgtrack.inputs.source import open_input
 from fgtrack.inputs.stream import write_stream
 from fgtrack.pipeline.replay import replay
 from fgtrack.runs import RunWriter, load_run
+from fgtrack.sim.scenario import Scenario
+from fgtrack.sim.simulate import simulate
 
 MS = 1_000_000
 SWEEP = (
@@ -45,6 +48,11 @@ def noisy(count: int = 120) -> list[Message]:
     return messages
 
 
+def one_second(scenario: Scenario, rng: np.random.Generator) -> Iterator[Message]:
+    """The first second of a simulated race."""
+    yield from simulate(replace(scenario, duration_s=1.0), rng)
+
+
 def content(path: Path) -> dict[str, bytes | None]:
     """Every file below `path` with its bytes, and every folder."""
     below = [path, *sorted(path.rglob("*"))]
@@ -61,7 +69,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(study, "simulate", lambda scenario, rng: standing(30))
+        patch.setattr(study, "simulate", one_second)
         write_stream("drive.jsonl", standing(30))
         write_stream("noisy.jsonl", noisy())
         write_stream("other.jsonl", standing(10))
@@ -79,7 +87,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 words
                 for words, _ in WRITERS
                 if words[0]
-                in ("figure", "report", "export", "tune", "advise", "info", "ledger")
+                in (
+                    "figure",
+                    "report",
+                    "export",
+                    "tune",
+                    "advise",
+                    "info",
+                    "ledger",
+                    "rank",
+                )
             ),
         ):
             assert run(list(words)) == 0
@@ -91,7 +108,7 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, a copy of that one; figures are copied, not drawn."""
     folder = shutil.copytree(made, tmp_path / "here")
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(study, "simulate", lambda scenario, rng: standing(30))
+    monkeypatch.setattr(study, "simulate", one_second)
 
     def redraw(named: object, folder: Path, form: str) -> list[Path]:
         return [
@@ -151,6 +168,14 @@ WRITERS = [
     (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
     (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
     (("ledger", "noisy.jsonl", "--figure", "ledger.png"), "ledger.png"),
+    (
+        ("rank", "drop", "--scenario", "one-late", "--runs", "2", "-o", "ranking"),
+        "ranking",
+    ),
+    (
+        ("rank", "--export", "problems", "--scenario", "one-late"),
+        "problems/one-late",
+    ),
 ]
 #: A sweep goes on where it was, and makes its tables anew.
 ONGOING = [
