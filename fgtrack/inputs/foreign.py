@@ -39,11 +39,10 @@ def check_content(path: Path) -> None:
     for file in _files(path):
         if file.stat().st_size > _LFS_BYTES:
             continue
-        with open_file(file) as content:
-            if content.read(len(_LFS)) == _LFS:
-                raise DataError(
-                    f"{file}: is a pointer of Git LFS instead of the file: fetch the file with `git lfs pull`"
-                )
+        if _begins_with_lfs(file, file == path):
+            raise DataError(
+                f"{file}: is a pointer of Git LFS instead of the file: fetch the file with `git lfs pull`"
+            )
     if path.is_file():
         with open_file(path) as content:
             if _OPENLABEL.match(content.read(_HEAD_BYTES)):
@@ -51,6 +50,21 @@ def check_content(path: Path) -> None:
                     f"{path}: is an annotation in OpenLABEL, which fgtrack does not read: "
                     "write its objects as CSV or as a stream"
                 )
+
+
+def _begins_with_lfs(file: Path, is_needed: bool) -> bool:
+    """Return True for a pointer of Git LFS.
+
+    A file of a folder may be unreadable, because it may be unused. Raises `OSError` for
+    an unreadable file that `is_needed`.
+    """
+    try:
+        with open_file(file) as content:
+            return content.read(len(_LFS)) == _LFS
+    except OSError:
+        if is_needed:
+            raise
+        return False
 
 
 def known_form(path: Path) -> str | None:
