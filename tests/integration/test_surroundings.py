@@ -79,17 +79,21 @@ def test_a_stream_that_cannot_be_written_to_is_a_line(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "made"),
+    ("words", "made", "steps"),
     [
-        ("advise drive.jsonl -c smoother -o advised.yaml", "advised.yaml"),
-        ("sweep sweep.yaml -o swept --jobs 1", "swept/summary.csv"),
+        ("advise drive.jsonl -c smoother -o advised.yaml", "advised.yaml", ""),
+        (
+            "sweep sweep.yaml -o swept --jobs 1",
+            "swept/summary.csv",
+            "fgtrack: sweep: 1 of 2\nfgtrack: sweep: 2 of 2\n",
+        ),
     ],
 )
 def test_what_is_to_be_written_is_written_though_the_reader_has_left(
-    folder: Path, words: str, made: str
+    folder: Path, words: str, made: str, steps: str
 ) -> None:
     done = shell(folder, f"(fgtrack {words}; echo $? >&2) | true")
-    assert done.stderr == "0\n"
+    assert done.stderr == f"{steps}0\n"
     assert (folder / made).exists()
 
 
