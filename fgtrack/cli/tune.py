@@ -110,7 +110,7 @@ def _four_digits(value: Value) -> str:
 
 
 def _short(key: Value) -> str:
-    """Configuration key without the parts that all keys share."""
+    """Short form of a configuration key: `radar x_m` for `sensors.radar.std.x_m`."""
     return (
         str(key)
         .removeprefix("sensors.")

@@ -94,7 +94,10 @@ _copier: Callable[[type], Callable[[Any], Any] | None] = cache(_new_copier)
 
 
 def _are_fixed(values: Collection[Any]) -> bool:
-    """True if none of the values can change. A tuple cannot change if none of its items can."""
+    """True if no value can change.
+
+    A tuple counts as fixed if its items are fixed and no item is a tuple.
+    """
     kinds = set(map(type, values))
     if tuple in kinds:
         kinds.remove(tuple)

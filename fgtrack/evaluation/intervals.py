@@ -90,8 +90,9 @@ def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
     variance of their sum is the mean of 2 (sum of x_t cos(pi j (t + 1/2) / n))^2 over j
     = 1 ... B (equal-weighted cosines). The interval uses Student's t with B degrees of
     freedom. B is a fifth of the number of correlation lengths (`correlation_length`) in the run, at
-    least 4. So the spectrum is flat over these frequencies. The interval is unknown for
-    fewer than eight ticks.
+    least 4, and at most a quarter of the number of ticks. So the spectrum is flat over
+    these frequencies. More than 400 ticks are first summed in pieces. The interval is
+    unknown for fewer than eight ticks.
 
     Sources: Lazarus, Lewis, Stock and Watson 2018 (Journal of Business & Economic
     Statistics 36(4)); Mueller 2007 (Journal of Econometrics 141(2)).

@@ -285,8 +285,9 @@ def _reports_the_innovation_against_all_that_it_has_fused(
 ) -> None:
     """Require the innovation and the NIS that the state before the measurement predicts.
 
-    The innovation of a late measurement is checked for estimators that predict it from later stamps too. A nonlinear
-    filter is checked for measurements in sequence alone.
+    A late measurement is checked for smoothers. In a linear model it is also checked for
+    estimators that retrodict. In a nonlinear model, estimators with sigma points are not
+    checked.
     """
     estimator, claims = subject.start(stream), subject.claims
     fused: list[Measurement] = []

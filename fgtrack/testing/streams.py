@@ -138,7 +138,10 @@ def regular(motion: MotionModel, rng: np.random.Generator, num: int = 12) -> Str
 def shuffled(
     motion: MotionModel, rng: np.random.Generator, span_s: float = 0.95 * LAG_S
 ) -> Stream:
-    """3 to 12 measurements in any order within `span_s` after the start; some stamps equal, some 1 us apart."""
+    """Return a stream of 3 to 22 measurements in random order, within `span_s` after the start.
+
+    Some stamps are equal, and some are 1 us apart.
+    """
     num = int(rng.integers(2, 8))
     offsets = 2 * MS * rng.integers(1, round(span_s * NS_PER_S) // (2 * MS), num)
     again, close = offsets[rng.random(num) < 0.25], offsets[rng.random(num) < 0.25] + US

@@ -189,8 +189,10 @@ def items_by_fields(
 
 
 def _items_at(message: RosMessage, parts: Sequence[str]) -> list[RosMessage] | None:
-    """Return the items of the list at the path `parts`, and of all lists on the path; None if the path ends at no
-    list.
+    """Return the items of the list at the path `parts`; None if the path ends at no list.
+
+    A list on the path is followed in each of its items. If such a path ends at no list,
+    it has no items.
     """
     value = message
     for number, part in enumerate(parts):

@@ -201,7 +201,11 @@ class EgoGrowth(Stateful):
         return mean, np.array([np.interp(at, known, times_s[:, k]) for k in range(2)])
 
     def covariance(self, ego: EgoState, duration_s: float) -> FloatArray:
-        """Covariance of x, y, yaw, speed and yaw rate of `ego` after `duration_s`, shape (5, 5)."""
+        """Growth of the covariance of x, y, yaw, speed and yaw rate of `ego` over `duration_s`, shape (5, 5).
+
+        The growth comes from unknown accelerations. The covariance of `ego` itself is not
+        included.
+        """
         by_accel, by_yaw_accel = self._parts(ego, duration_s)
         return by_accel + by_yaw_accel
 
