@@ -319,9 +319,8 @@ def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(
             assert -math.pi < mean[2] <= math.pi
             assert np.array_equal(covariance, covariance.T)
             scale = np.sqrt(np.diag(covariance))
-            normalised = (
-                covariance / np.outer(scale, scale) if scale.all() else covariance
-            )
+            scale = np.where(scale > 0.0, scale, 1.0)  # an entry of 0 stays 0
+            normalised = covariance / np.outer(scale, scale)
             assert np.linalg.eigvalsh(normalised).min() >= -1e-8
 
 
