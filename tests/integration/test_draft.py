@@ -338,7 +338,7 @@ def test_an_open_decision_has_a_question_and_no_settings():
         Decision("radar", "frame", {}, "open", "unknown")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_study_of_a_foreign_bag_begins_with_the_assumptions_and_asks(
     bag, tests, tmp_path, monkeypatch, capsys
 ):
