@@ -51,7 +51,7 @@ def lines(separator=",", end="\n", comma=False, header=HEADER):
         ("sep=;\n" + lines(";", comma=True)).encode(),
         ("\n\n" + lines()).encode(),
         ("# exported on Tuesday\n# by me, too, and so on\n" + lines()).encode(),
-        gzip.compress(lines(";", comma=True).encode("utf-8-sig")),
+        gzip.compress(lines(";", comma=True).encode("utf-8-sig"), mtime=0),
         lines(end=",\n").encode(),
         lines(end=",,,\n").encode(),
         (lines().replace("\n", ",,\n", 1)).encode(),
