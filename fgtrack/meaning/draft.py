@@ -78,7 +78,7 @@ class Draft:
 
     @property
     def problem(self) -> str | None:
-        """Line on the questions that must be answered before all sensors are used; None if there is none."""
+        """Line on the questions that must be answered before all sensors are used; None without open questions."""
         asked = [item for item in self.decisions if item.certainty == "open"]
         if not asked:
             return None

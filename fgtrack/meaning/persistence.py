@@ -196,7 +196,7 @@ def _crowding_per_m2(
     loose: BoolArray,
     of_clutter: float,
 ) -> float:
-    """Density of clutter near other clutter of the same list.
+    """Density of false detections near other false detections of the same list.
 
     `loose` marks detections in no triple; `of_clutter` of them are clutter. `numbers`
     contains the index of the list of each detection.

@@ -29,7 +29,7 @@ class Sample:
     given: Config
     """Settings of the user."""
     config: Config
-    """Settings of the user, with those that are decided so far."""
+    """Settings of the user and settings that are decided so far."""
     messages: Sequence[Message]
     """Messages of the first `SAMPLE_S`, in the order of receipt; without ignored sensors."""
 

@@ -37,7 +37,7 @@ _MAX_FUTURE_NS = (
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The usable detections of one message that have the same stamp."""
+    """Usable detections of one message with the same stamp."""
 
     message: DetectionList
     stamp_ns: int
