@@ -14,11 +14,8 @@ either of the object or of the ego. The axes with the smaller residuals are used
 the velocity hardly changes, bias and offset cannot be separated, and the offset stays
 unknown.
 
-The standard deviation of d is a jackknife over stretches of time. So it includes
-time-correlated errors (Bell and McCaffrey, Survey Methodology 28, 2002). The ratio of d
-to its standard deviation follows Student's t distribution. Its degrees of freedom are
-the effective number of stretches minus 1. Stretches of unequal information count as
-fewer (Carter, Schnepel and Steigerwald, Review of Economics and Statistics 99, 2017).
+The standard deviation of d is a jackknife over stretches of time
+(`fgtrack.core.jackknife`). So it includes time-correlated errors.
 """
 
 import itertools
@@ -41,6 +38,7 @@ from fgtrack.clocks.paths import (
 from fgtrack.config.settings import Config
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.geometry import rotations
+from fgtrack.core.jackknife import Information, jackknife
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
@@ -75,6 +73,8 @@ _SHORTEST_STRETCH_S = 1.0
 _ROUNDS = 10
 _LARGEST_STEP_S = 0.2
 _REACH_S = 1.0
+# Information of a prior, which makes the equations regular.
+_PRIOR = 1e-9
 # Huber width in units of the median residual.
 _HUBER = 1.5
 # A bias is reported if it is significant, and large enough for a calibration.
@@ -459,7 +459,7 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     weights = np.ones(len(r))
     scale_m = 1.0
     for _ in range(5):
-        H = np.einsum("n,nij,nik->jk", weights, A, A) + 1e-9 * np.eye(size)
+        H = np.einsum("n,nij,nik->jk", weights, A, A) + _PRIOR * np.eye(size)
         x = -psd_solve(H, np.einsum("n,nij,ni->j", weights, A, r))
         residual_m = np.hypot(*(r + A @ x).T)
         scale_m = max(float(np.median(residual_m)), 1e-6)
@@ -474,16 +474,10 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     )
     if len(names) < _FEWEST_STRETCHES:
         return _Fit(x, unknown, 0.0, cost)
-    parts = np.zeros((len(names), size, size))
-    scores = np.zeros((len(names), size))
-    np.add.at(parts, stretches, np.einsum("n,nij,nik->njk", weights, A, A))
-    np.add.at(scores, stretches, np.einsum("n,nij,ni->nj", weights, A, r + A @ x))
-    # Change of the solution if a stretch is left out.
-    changes = psd_solve(H - parts, scores[:, :, None])[:, :, 0]
-    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(changes).sum(axis=0))
-    # Share of each stretch in the information on the offset.
-    column = psd_solve(H, np.eye(size)[0])
-    shares = np.einsum("j,njk,k->n", column, parts, column) / column[0]
-    if not shares.any():  # no object moves
-        return _Fit(x, unknown, 0.0, cost)
-    return _Fit(x, std, 1.0 / float(shares @ shares) - 1.0, cost)
+    data = Information(
+        np.einsum("n,nij,nik->njk", weights, A, A),
+        np.einsum("n,nij,ni->nj", weights, A, r + A @ x),
+        np.full(size, _PRIOR),
+    )
+    std, dof = jackknife(data, stretches, np.eye(size))
+    return _Fit(x, std, float(dof[0]), cost)
