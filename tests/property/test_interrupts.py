@@ -118,8 +118,17 @@ def end(one: Tracker) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("is_published", [False, True], ids=["clean", "one_slot"])
-def test_an_interrupt_before_any_line_loses_no_detection(is_published: bool) -> None:
+@pytest.mark.parametrize(
+    ("is_published", "stride"),
+    [
+        pytest.param(False, 1, id="clean", marks=pytest.mark.slow),
+        pytest.param(False, 5, id="clean, every fifth line"),
+        pytest.param(True, 1, id="one_slot"),
+    ],
+)
+def test_an_interrupt_before_any_line_loses_no_detection(
+    is_published: bool, stride: int
+) -> None:
     one = tracker(**({"defects": ["one_slot"]} if is_published else {}))
     sent = [message for k in range(4) for message in messages(k)]
     for k in range(3):
@@ -141,7 +150,7 @@ def test_an_interrupt_before_any_line_loses_no_detection(is_published: bool) -> 
     chosen = first_and_last(lines)
     assert len(chosen) > (20 if is_published else 300)
     assert counted(one) == lengths(sent)
-    for at in chosen:
+    for at in chosen[::stride]:
         interrupted(at)
         one.tick(START_NS + 400 * MS)
         one.finish()
