@@ -1,4 +1,4 @@
-"""Agreement of the positions of two sensors: the common displacement of their detections of the same objects."""
+"""Agreement of the positions of two sensors: the common displacement between their detections of the same objects."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,22 +49,25 @@ _LEAST_LIMIT_M = 1.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """Common displacement of the positions of a sensor from those of a reference sensor, on the same objects."""
+    """Displacement between the positions that a sensor and a reference sensor measure of the same objects."""
 
     sensor: str
     reference: str
     pairs: int
-    """Number of detections of the sensor near the path of an object of the reference."""
+    """Number of stamps at which a detection of the sensor lies within 40 m of an object of the reference."""
     share: float
-    """Share of the pairs at the common displacement."""
+    """Share of these stamps at which such a detection has the most frequent displacement."""
     displacement_m: tuple[float, float]
-    """Displacement ahead and to the left in the frame of the ego; to the east and north without an ego."""
+    """Median of the sensor's position minus the reference's position; NaN for too few pairs.
+
+    The axes point ahead and to the left of the ego, or to the east and north if `in_map`.
+    """
     half_m: float
-    """Half of the 95 % interval of each coordinate."""
+    """Half-width of the 95 % interval of each coordinate of the displacement; infinite for too few pairs."""
     limit_m: float
-    """Largest displacement that is no disagreement: the scatter of the pairs, and at least 1 m."""
+    """Largest displacement that does not count as a disagreement: the scatter of the pairs, but at least 1 m."""
     in_map: bool
-    """True if the displacement is in the map frame."""
+    """True if the axes of the displacement are those of the map; False for the axes of the ego."""
 
     @property
     def distance_m(self) -> float:
@@ -73,7 +76,7 @@ class Agreement:
 
     @property
     def is_known(self) -> bool:
-        """True if enough pairs have a common displacement, and its interval is narrow."""
+        """True if enough pairs have a common displacement, and its 95 % interval is narrower than the limit."""
         return (
             self.pairs >= _FEWEST
             and self.share >= _LEAST_SHARE
@@ -82,7 +85,7 @@ class Agreement:
 
     @property
     def is_off(self) -> bool:
-        """True if the sensors disagree: a displacement above the limit, and above its interval."""
+        """True if the sensors disagree: the known displacement exceeds `limit_m` plus `half_m`."""
         return self.is_known and self.distance_m > self.limit_m + self.half_m
 
     def __str__(self) -> str:
@@ -100,11 +103,10 @@ class Agreement:
 def agreements(
     messages: Sequence[Message], config: Config, run: Run
 ) -> list[Agreement]:
-    """Return the agreement of each sensor with the sensor that has most detections in the tracks of `run`.
+    """Return the agreement of each sensor with the reference: the sensor with most detections in the tracks of `run`.
 
-    `run` is a run of `messages`. Only sensors with positions, or with range and bearing,
-    are compared. A sensor without a detection near an object of the reference has 0
-    pairs.
+    `run` is a run of `messages`. Only sensors with positions, or with range and bearing, are compared. A sensor without
+    a detection near an object of the reference has 0 pairs. The result is empty if the ego has too few states.
     """
     lists = [
         corrected(item, config.sensors)
@@ -192,7 +194,11 @@ def _displacements(
     paths: Sequence[ObjectPath],
     ego: EgoPath | None,
 ) -> tuple[IntArray, FloatArray]:
-    """Stamps (n,) and displacements (n, 2) of all detections in `tracks` from all paths within the reach."""
+    """Return stamps (n,) and displacements (n, 2) of the detections in `tracks` from `paths` of the reference.
+
+    A detection is compared with each path, and the displacement counts if it is shorter than `_REACH_M`. The axes are
+    those of the ego, or of the map without an `ego`.
+    """
     stamps: list[IntArray] = []
     offsets: list[FloatArray] = []
     for one in tracks.values():
@@ -211,7 +217,7 @@ def _displacements(
 
 
 def _mode(points_m: FloatArray) -> BoolArray:
-    """Mask of the points at the most frequent displacement, shape (n,): within three times their scatter."""
+    """Return the mask (n,) of the displacements `points_m` (n, 2) that lie near the most frequent displacement."""
     cells = np.rint(points_m / _CELL_M).astype(np.int64)
     size = 2 * math.ceil(_REACH_M / _CELL_M) + 3
     counts = np.zeros((size, size))
@@ -231,7 +237,7 @@ def _mode(points_m: FloatArray) -> BoolArray:
 
 
 def agreement_findings(found: Sequence[Agreement]) -> Iterator[Finding]:
-    """Yield the sensors that disagree with the reference sensor."""
+    """Yield a finding for each sensor that disagrees with the reference sensor."""
     for one in found:
         if one.is_off:
             text = (

@@ -81,7 +81,7 @@ class Arrivals:
 
     @cached_property
     def steps_s(self) -> FloatArray:
-        """Time between successive different stamps."""
+        """Times between successive distinct stamps, in ascending order of the stamps."""
         return np.asarray(
             np.diff(np.unique(self.stamps_ns)) / NS_PER_S, dtype=np.float64
         )
@@ -106,7 +106,7 @@ class Arrivals:
 
     @property
     def is_receipt(self) -> bool:
-        """True if every stamp equals the receipt."""
+        """True if every stamp equals the receipt to 1 us."""
         return bool(np.all(np.abs(self.receipts_ns - self.stamps_ns) <= 1000))
 
     def quantile_s(self, share: float) -> float:
@@ -125,7 +125,7 @@ class Arrivals:
         )
 
     def share_later_than(self, lag_s: float) -> float:
-        """Return the share of detections with a delay above `lag_s`."""
+        """Return the share of all detections that have a usable delay above `lag_s`."""
         return float(
             self.counts[(self.delays_s > lag_s) & self.usable].sum()
             / max(self.counts.sum(), 1)
@@ -194,7 +194,10 @@ def overtaken_shares(
 
 
 def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Finding]:
-    """Yield findings on delays: refused detections, too short a window, too short a life of tracks."""
+    """Yield findings on delays: refused detections, too short a window, too short a life of tracks.
+
+    Each finding proposes the setting that is long enough.
+    """
     needed_s = 0.0
     for one in arrivals:
         most_s = one.quantile_s(1.0 - _LOST)
@@ -222,10 +225,10 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
 def _too_short(
     arrivals: Sequence[Arrivals], config: Config, needed_s: float
 ) -> Iterator[Finding]:
-    """Yield a window that is shorter than the delays or a period, and a track life shorter than a period.
+    """Yield a finding on the estimator's window, and a finding on the life of tracks, if they are too short.
 
-    `needed_s` is the delay within which the detections arrive. The period belongs to
-    the slowest sensor.
+    The window must cover `needed_s`, within which the detections arrive, and the period of the slowest sensor. A track
+    must live longer than this period.
     """
     slowest = max(arrivals, key=lambda item: item.period_s, default=None)
     if slowest is None:

@@ -121,7 +121,7 @@ class SensorOffset:
 
     @property
     def half_s(self) -> float | None:
-        """Half-width of the 95 % interval of the offset; None without an offset, or if it is very wide."""
+        """Half-width of the 95 % interval of the offset; None without an offset, or with a very wide interval."""
         half_s = self._times_std_s(0.975)
         return half_s if half_s < 2.0 * _LARGEST_HALF_S else None
 
@@ -176,7 +176,10 @@ class OffsetReport:
     """Name of the reference sensor, or `truth`."""
     sensors: tuple[SensorOffset, ...]
     least_delays_s: Mapping[str, float]
-    """Shortest delay of each sensor. Its stamps are early by at most this time."""
+    """Shortest delay from stamp to receipt of each sensor, by name.
+
+    No list is received before it was measured. So the stamps of a sensor are too early by at most this time.
+    """
 
     @property
     def others(self) -> list[SensorOffset]:
@@ -184,10 +187,10 @@ class OffsetReport:
         return [item for item in self.sensors if item.sensor != self.reference]
 
     def surely_late_s(self, one: SensorOffset) -> float | None:
-        """Return the time by which the later of two clocks is late at least.
+        """Return the time by which the stamps of one of the two sensors are late for certain.
 
-        It is negative if the reference has the later clock. None if either clock may be
-        wrong.
+        Positive if the stamps of the sensor of `one` are late, negative if the stamps of the reference are. None if
+        either clock may be wrong, or if the offset is not significant.
         """
         if not one.is_off or one.offset_s is None or one.half_s is None:
             return None
@@ -226,17 +229,15 @@ def estimate_offsets(
 ) -> OffsetReport:
     """Return the clock offsets of the sensors, estimated from the tracks of the tracker of `config`.
 
-    Without truth, or with a given `reference`, an offset is the difference of two
-    clocks. The default reference is the sensor with most detections. It is no
-    `doubtful` sensor, and no sensor with a late clock for certain: no list is received
-    before it was measured.
+    With truth, and without a given `reference`, an offset is the error of the clock. Otherwise it is the difference
+    from the clock of the reference sensor. The default reference is the sensor with most detections, without the
+    `doubtful` sensors. If delays prove that its stamps are late, another sensor becomes the reference.
 
-    No message is refused for its delay, because a wrong stamp looks like a delay. `run`
-    is a run of `messages` in which none was refused. Without it the messages are
-    replayed.
+    No message is refused for its delay, because a wrong stamp looks like a delay. `run` is a run of `messages` in which
+    none was refused. Without it the messages are replayed.
 
-    Raises `CallError` for an unknown reference. Raises `DataError` without detections,
-    or with fewer than five ego states.
+    Raises `CallError` for an unknown reference. Raises `DataError` without detections, or with fewer than five ego
+    states.
     """
     corrected_messages = [
         corrected(item, config.sensors) if isinstance(item, DetectionList) else item
@@ -409,9 +410,10 @@ _Frames = dict[Literal["ego", "vehicle"], FloatArray]
 def _residuals(
     pairs: Sequence[_Pair], offset_s: float
 ) -> tuple[FloatArray, FloatArray, _Frames]:
-    """Return residuals at `offset_s` (n, 2), their derivatives (n, 2), and axes of a bias (n, 2, 2).
+    """Return residuals at `offset_s` (n, 2), their derivatives by the offset (n, 2), and the axes of a bias by frame.
 
-    The derivatives are with respect to the offset. The axes are given by frame.
+    A residual is the position on the path minus the measured position, in the map. The axes (n, 2, 2) have the
+    directions ahead and left as columns, for the frames `ego` and `vehicle`.
     """
     step_ns = nanoseconds(_STEP_S)
     rows = []

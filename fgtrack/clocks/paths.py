@@ -96,9 +96,9 @@ class ObjectPath:
     """Path of one object in the map frame."""
 
     stamps_ns: IntArray
-    """Ascending times of its measurements, shape (n,)."""
+    """Ascending times of the measured positions, shape (n,)."""
     curve: BSpline
-    """Position in m as a function of the seconds since the first measurement."""
+    """Position in m as a function of the seconds since the first measured position."""
 
     @classmethod
     def through(
@@ -147,7 +147,10 @@ class MeasuredPositions:
     """Path of the ego; None if all positions are in the map frame."""
 
     def at(self, times_ns: IntArray) -> FloatArray:
-        """Return the positions in the map, shape (n, 2), as if they had been measured at `times_ns` (n,)."""
+        """Return the positions in the map, shape (n, 2), as if they had been measured at `times_ns` (n,).
+
+        The pose of the ego is taken at `times_ns`. NaN where it is not known.
+        """
         if self.ego is None:
             return self.positions_m
         pose = self.ego(times_ns)
@@ -190,10 +193,10 @@ def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
 def measured_positions(
     run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
 ) -> dict[str, dict[int, MeasuredPositions]]:
-    """Return the positions that `run` fused, by sensor and track.
+    """Return the positions that `run` fused, by name of the sensor and id of the track.
 
-    `lists` are the detection lists of the run. They are transformed and merged as in
-    the tracker. `ego` is None if all detections are in the map frame.
+    `lists` are the detection lists of the run. They are transformed and merged as in the tracker. `ego` is None if all
+    detections are in the map frame.
     """
     updates = run.tables["updates"]
     fused = updates.where(

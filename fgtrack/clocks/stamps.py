@@ -83,16 +83,21 @@ def share_ahead(one: Arrivals) -> float:
 
 
 class DelayChange(NamedTuple):
-    """Largest permanent change of the mean delay of a sensor, at the best of seven splits."""
+    """Largest permanent change of the mean delay of a sensor.
+
+    The recording is divided into ten parts, which are split into parts before and after the change.
+    """
 
     before_s: float
+    """Mean delay before the change."""
     after_s: float
+    """Mean delay after the change."""
     at_s: float
-    """Time of the change since the first receipt."""
+    """Time of the change, counted from the first receipt."""
     std_s: float
     """Standard deviation of the change."""
     correlation: float
-    """Correlation of the delay with time, over ten parts."""
+    """Correlation of the delay with time over the ten parts; near 1 or -1 for a drift."""
 
     @property
     def change_s(self) -> float:
@@ -101,12 +106,12 @@ class DelayChange(NamedTuple):
 
     @property
     def limit_s(self) -> float:
-        """Least change that is no scatter."""
+        """Smallest change that is more than scatter."""
         return max(_CHANGE_S, _DRIFT_STDS * self.std_s)
 
     @property
     def is_change(self) -> bool:
-        """True if the change is a jump or a drift, and no scatter."""
+        """True for a jump or a drift of the delay; False for scatter."""
         if self.change_s < self.limit_s:
             return False
         is_jump = self.change_s >= _JUMP_STDS * self.std_s
@@ -114,9 +119,9 @@ class DelayChange(NamedTuple):
 
 
 def delay_change(one: Arrivals) -> DelayChange | None:
-    """Return the largest permanent change of the delay, by the medians of ten parts.
+    """Return the largest permanent change of the delay, computed from the medians of ten parts of the recording.
 
-    None for a short recording.
+    None if the recording is too short.
     """
     times_s = (one.receipts_ns - one.receipts_ns[0]) / 1e9
     if len(times_s) < _PARTS * FEWEST or times_s[-1] < _PARTS * _SHORTEST_PART_S:
@@ -140,7 +145,7 @@ def delay_change(one: Arrivals) -> DelayChange | None:
 
 
 def _change(one: Arrivals) -> Iterator[Finding]:
-    """Yield a permanent change of the delay: a jump, or a drift."""
+    """Yield a finding on a permanent change of the delay: a jump or a drift."""
     change = delay_change(one)
     if change is not None and change.is_change:
         text = (
@@ -211,9 +216,10 @@ def _bound(one: SensorOffset, report: OffsetReport) -> str:
 def clock_findings(
     report: OffsetReport, configured_s: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """Yield the sensors with a clock offset or an unknown clock.
+    """Yield a finding for each sensor with a clock that differs from the reference, or with an unknown clock.
 
-    `configured_s` is the offset by sensor that the configuration already subtracts.
+    `configured_s` contains, by sensor, the offset that the configuration subtracts already. The proposed setting is the
+    sum of this offset and the estimate.
     """
     for one in report.others:
         if one.is_off and one.offset_s is not None:
@@ -225,10 +231,10 @@ def clock_findings(
 
 
 def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
-    """Yield constant position errors against the truth.
+    """Yield findings on constant position errors against the truth.
 
-    If all sensors share one error in the ego frame, a setting of the ego corrects it.
-    Else each sensor is reported.
+    If all sensors share one error in the ego frame, the finding proposes another origin of the ego frame. Else there is
+    a finding for each sensor with an error.
     """
     biased = {
         item.sensor: item.bias for item in report.sensors if item.bias is not None

@@ -43,7 +43,7 @@ class CodeStore:
         return pickle.loads(code)
 
     def save(self, key: object, data: object) -> None:
-        """Save `data`; damaged files are replaced. Raises `OSError`."""
+        """Store `data` under `key`; damaged files are replaced, code of other sources is deleted. Raises `OSError`."""
         code = pickle.dumps(data)
         try:
             stamp, stored = self._read()
@@ -57,7 +57,7 @@ class CodeStore:
             self._code_path(unused).unlink(missing_ok=True)
 
     def flush(self) -> None:
-        """Forget all codes. Raises `OSError`."""
+        """Empty the index, so that no stored code is used any more. Raises `OSError`."""
         self._write({})
 
     def _code_path(self, digest: str) -> Path:
@@ -87,7 +87,7 @@ class CodeStore:
 
 
 def _key_text(key: object) -> str:
-    """Text for a signature and a processor."""
+    """Return a digest of `key`, which consists of a signature and a processor, as text."""
     return sha256(repr(key).encode()).hexdigest()[:16]
 
 

@@ -25,7 +25,7 @@ class Diagnostic:
     text: str
     """Problem, cause and remedy, without a full stop."""
     settings: Mapping[str, object] = field(default_factory=dict)
-    """Configuration keys and the values that correct the problem; empty if no setting certainly does."""
+    """Configuration keys and the values that correct the problem; empty if it is not certain that a setting does."""
     is_blocking: bool = False
     """True if the recording cannot be judged until this problem is corrected."""
 
@@ -42,7 +42,10 @@ def reasons(counts: Mapping[str, int]) -> str:
 
 
 def in_degrees(about: str, name: str, least: float, most: float) -> Diagnostic | None:
-    """Diagnostic that the angle `name`, from `least` to `most`, is in degrees; None if it may be in radians."""
+    """Return the diagnostic that the angle `name` is in degrees, from its smallest and largest recorded value.
+
+    None if the values may be radians. `about` is the sensor, or another subject.
+    """
     if may_be_radians(least, most):
         return None
     text = (
@@ -90,10 +93,10 @@ def too_late(
 
 
 def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | None:
-    """Diagnostic that the ego's messages arrive later than the lists that need the ego's pose; None if they do not.
+    """Return the diagnostic that the ego's messages arrive later than lists that need its pose; None if they do not.
 
-    `ego_delay_s` is the usual time from stamp to receipt of the ego's messages.
-    `delays_s` contains this time for each sensor whose lists need the ego's pose.
+    `ego_delay_s` is the usual time from stamp to receipt of the ego's messages. `delays_s` contains this time for each
+    sensor whose lists need the ego's pose.
     """
     sooner = {
         name: delay_s

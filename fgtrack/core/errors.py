@@ -51,7 +51,7 @@ def one_line(text: str) -> str:
 
 
 def _without_middle(match: re.Match[str]) -> str:
-    """Return the two ends of a long word."""
+    """Return the beginning and the end of a long word, with `...` between them."""
     word = match[0]
     return f"{word[:_WORD_HEAD]}...{word[-_WORD_TAIL:]}"
 

@@ -18,7 +18,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Alias:
-    """Present name of a part that had another name."""
+    """Replacement for a former name of a part."""
 
     name: str
     """Present name of the part."""

@@ -35,7 +35,7 @@ class Stateful:
         return copied_attributes(self, self.STATE)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Put a checkpoint back, which stays as it is and can be put back again."""
+        """Set the state to that of a checkpoint. The checkpoint stays as it is, and can be restored again."""
         put_back(self, self.STATE, snapshot)
 
 
@@ -45,7 +45,7 @@ def copied_attributes(owner: object, names: Iterable[str]) -> Snapshot:
 
 
 def put_back(owner: object, names: Iterable[str], snapshot: Snapshot) -> None:
-    """Give an object the attributes `names` of a snapshot, which stays as it is."""
+    """Set the attributes `names` of `owner` to the values in a snapshot, which stays as it is."""
     for name in names:
         own = getattr(owner, name)
         if isinstance(own, Stateful):

@@ -13,7 +13,7 @@ _FEWEST = 10
 
 
 def epoch_unit(value: float) -> str | None:
-    """Unit (`s`, `ms`, `us`, `ns`) in which `value` is a time in the years 2001 to 2096; None if there is none."""
+    """Return the unit (`s`, `ms`, `us`, `ns`) in which `value` is a time in the years 2001 to 2096, or None."""
     return next(
         (
             unit

@@ -270,7 +270,7 @@ class UpdateRecord:
     innovation: Mapping[str, float] = field(default_factory=dict)
     """Measured minus predicted value, by name of `MEASURABLE`."""
     reason: str | None = None
-    """Setting by which the detection is out of bounds; None for other dispositions."""
+    """Setting by which the detection is out of bounds; None for every other disposition."""
     yaw: YawWord | None = None
     """`flipped` if the measured yaw was turned by half a turn, `unused` if the innovation lacks it."""
 

@@ -302,7 +302,7 @@ class Start:
     position_std_m: float = 1.0
     """Standard deviation along both axes; not used if `position_covariance` is given."""
     position_covariance: FloatArray | None = None
-    """Shape (2, 2)."""
+    """Covariance of x and y, shape (2, 2); None: `position_std_m` applies."""
     position_cross: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Covariance of the position with other entries of the state, by their names, for example with a
     time-correlated sensor error. `yaw_rad` and `speed_mps` may be named for every motion model.
@@ -314,7 +314,11 @@ class Start:
     yaw_rad: float | None = None
     """Direction of travel; None if it is unknown."""
     yaw_std_rad: float | None = None
-    """None stands for `KNOWN_YAW_STD_RAD`, or for `UNKNOWN_YAW_STD_RAD` if `yaw_rad` is None."""
+    """Standard deviation of the direction of travel.
+
+    None: `KNOWN_YAW_STD_RAD`, 0.1 rad, if `yaw_rad` is given. Otherwise `UNKNOWN_YAW_STD_RAD`, pi / sqrt(3) rad, the
+    standard deviation of a uniform direction.
+    """
     speed_mps: float = 0.0
     speed_std_mps: float = 10.0
     yaw_rate_radps: float = 0.0

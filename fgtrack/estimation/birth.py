@@ -63,10 +63,10 @@ def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatA
 
 
 def _crosses(start: Start) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the cross-covariances of position, yaw and speed: with each other, and with other entries by name.
+    """Return the covariances of a `start` between different entries of the state.
 
-    The first result is an upper triangle of x, y, yaw and speed, shape (4, 4). The second result has a column (4,)
-    for each name.
+    The first result has the covariances among x, y, yaw and speed, an upper triangle of shape (4, 4). The second result
+    has, by name of a further entry of the state, its covariances with x, y, yaw and speed, shape (4,).
     """
     kinematic, further = np.zeros((4, 4)), dict[str, FloatArray]()
     given = (

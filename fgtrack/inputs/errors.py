@@ -85,6 +85,6 @@ class UntilBreak(Generic[_T]):
             self.error = error
 
     def raise_error(self) -> None:
-        """Raise the error that ended the messages, if there was one."""
+        """Raise the `DataError` that ended the messages; do nothing if they ended regularly."""
         if self.error:
             raise self.error

@@ -32,9 +32,9 @@ _TAR = (257, b"ustar")
 
 
 def check_content(path: Path) -> None:
-    """Raise `DataError` if `path` has a form that looks like a form which fgtrack reads.
+    """Raise `DataError` for files that look like an input of fgtrack, but contain something else.
 
-    These forms are pointers of Git LFS, also in a folder, and annotations in OpenLABEL.
+    These are pointers of Git LFS, at `path` or in a folder `path`, and annotations in OpenLABEL.
     """
     for file in _files(path):
         if file.stat().st_size > _LFS_BYTES:
@@ -53,10 +53,10 @@ def check_content(path: Path) -> None:
 
 
 def _begins_with_lfs(file: Path, is_needed: bool) -> bool:
-    """Return True for a pointer of Git LFS.
+    """Return True if `file` is a pointer of Git LFS.
 
-    A file of a folder may be unreadable, because it may be unused. Raises `OSError` for
-    an unreadable file that `is_needed`.
+    A file that cannot be read counts as False, because a folder may contain unused files. If it `is_needed`, the
+    `OSError` is raised.
     """
     try:
         with open_file(file) as content:
@@ -68,7 +68,10 @@ def _begins_with_lfs(file: Path, is_needed: bool) -> bool:
 
 
 def known_form(path: Path) -> str | None:
-    """Return what the file `path` is and what to do, if fgtrack does not read it; None for an unknown form."""
+    """Return a clause for a message about the file `path`: its format, and how to convert it to an input of fgtrack.
+
+    None if the format is unknown.
+    """
     if not path.is_file():
         return None
     with open_file(path) as file:

@@ -59,9 +59,10 @@ class LocalPlane:
     def in_plane(
         self, values: Mapping[str, Any]
     ) -> dict[str, Any]:  # Any: values of mapped fields
-        """Return `values` with x_m and y_m instead of latitude_deg and longitude_deg.
+        """Return `values` with x_m and y_m in the plane instead of latitude_deg and longitude_deg.
 
-        A missing coordinate gives None, an invalid one NaN.
+        If a coordinate is None, x_m and y_m are None; if it is invalid, they are NaN. `values` without latitude_deg
+        keep their x_m and y_m.
         """
         rest = dict(values)
         latitude_deg, longitude_deg = (rest.pop(name, None) for name in GEODETIC)

@@ -28,7 +28,11 @@ _Item = TypeVar("_Item")
 
 
 class _Sorter(Generic[_Item]):
-    """Separates items with wrong receipts from the other items; see `sorted_out`."""
+    """Decides for each item whether its receipt is wrong; see `sorted_out`.
+
+    Items wait until they are decided: the first items of the recording, and items whose receipts are far from the
+    others.
+    """
 
     def __init__(self) -> None:
         #: Items from the beginning, until there are enough of them to be certainly right.
@@ -41,14 +45,14 @@ class _Sorter(Generic[_Item]):
         self._far_newest_ns = 0
 
     def neutral(self, item: _Item) -> Iterator[tuple[_Item, bool]]:
-        """Take an item whose receipt does not count, and yield decided items, each with True if it is wrong."""
+        """Take an item without a receipt, and yield the items that are decided now, each with True if it is wrong."""
         if self._head:
             self._head.append(item)
         else:
             yield item, False
 
     def take(self, item: _Item, receipt_ns: int) -> Iterator[tuple[_Item, bool]]:
-        """Take an item, and yield decided items, each with True if it is wrong."""
+        """Take an item, and yield the items that are decided now, each with True if it is wrong."""
         newest_ns = receipt_ns if self._newest_ns is None else self._newest_ns
         far_ns = _FAR_NS if newest_ns else _FAR_FROM_ZERO_NS
         if abs(receipt_ns - newest_ns) > far_ns:
@@ -97,7 +101,10 @@ class _Sorter(Generic[_Item]):
             yield from self._accept_far()
 
     def _replace_head(self) -> Iterator[tuple[_Item, bool]]:
-        """Yield the head as wrong; the far items are the right ones."""
+        """Yield the first items of the recording as wrong, and the items with far receipts as right.
+
+        There are many more items with far receipts than first items.
+        """
         yield from ((each, True) for each in self._head or ())
         self._head = None
         self._num_near = 0

@@ -206,7 +206,10 @@ class BackwardForwardBank(Stateful):
         return results
 
     def _visible_from(self, back: int) -> int:
-        """First grid index at which look-ups use a state that was corrected `back` steps ago."""
+        """Return the first grid index at which a state that was corrected `back` steps ago is used.
+
+        Look-ups at earlier grid points use the state before.
+        """
         return self._grid - back
 
     def birth(self, track_id: int, prior: Start) -> None:

@@ -173,7 +173,11 @@ class SlotInbox(Inbox):
         ended: list[UpdateRecord],
         slot: list[Batch] | None,
     ) -> list[UpdateRecord]:
-        """Note what becomes of `message`: the batch in the `slot` of its sensor from now on; None for no change."""
+        """Store the batch of a `message`, and return the records of detections that end here.
+
+        `slot` becomes the content of the sensor's slot: the batch, or an empty list. Detections that it replaces are
+        superseded. None leaves the slot as it is. `ended` are records of detections of the message itself.
+        """
         pending, last_ns = self.pending, self._last_stamp_ns
         if slot is not None:
             former = [each for each in pending if each.message.sensor == message.sensor]

@@ -80,7 +80,7 @@ class CorrelatedErrors(MotionModel):
         return np.array([1.0 / time_s for _, time_s in self.times_s])
 
     def _log_decays(self, dt_s: float | FloatArray) -> FloatArray:
-        """Logarithm -dt / T of the decay of each error, shape (..., errors)."""
+        """Logarithm of the factor exp(-dt / T) by which each error decays, shape (..., errors)."""
         return np.minimum(
             -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz,
             _MAX_EXPONENT,
@@ -159,12 +159,11 @@ def split_error(
     R: FloatArray,
     state_names: Sequence[str],
 ) -> tuple[MeasurementModel, FloatArray]:
-    """Return the measurement model with the correlated error, and the covariance of the white rest, shape (k, k).
+    """Return the measurement model with the correlated error as a part of the state, and the white rest of R.
 
-    `R`, shape (k, k), is the covariance of the whole error. The share s =
-    `model.correlation.share` of the block of components that the sensor itself measures
-    is correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R). So a single detection keeps
-    the covariance R.
+    `R`, shape (k, k), is the covariance of the whole error. The share s = `model.correlation.share` of the block of the
+    components that the sensor itself measures is correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R). So a single
+    detection keeps the covariance R. The white rest is (1 - s) R in this block, shape (k, k).
     """
     if model.correlation is None:
         return measurement, R

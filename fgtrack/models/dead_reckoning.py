@@ -60,11 +60,12 @@ def estimate_position(
     velocity_mps: tuple[float, float],
     errors: ReportedErrors,
 ) -> PositionEstimate:
-    """Return the estimate at `stamp_ns` from the `last` estimate and the new report.
+    """Return the position estimate at `stamp_ns`: the `last` estimate, moved by the velocity and corrected by the
+    report.
 
-    Without a usable `last` estimate the position is the reported one. The prediction of
-    p is first moved to within three standard deviations of b from the reported
-    position. This limit holds for wrong velocities and for gaps between reports.
+    `reported_m` and `velocity_mps` are in the map frame. Without a `last` estimate, or if a position is not finite, the
+    reported position is returned. The predicted position is first limited to a distance of three stationary standard
+    deviations from the reported position. This limit holds for wrong velocities and for gaps between reports.
     """
     variance_m2, time_s, density_m2ps = errors
     if last is not None:

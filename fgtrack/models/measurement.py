@@ -76,7 +76,7 @@ class MeasurementModel:
             )
 
     def __reduce_ex__(self, protocol: Any) -> Any:  # Any: as `object` has it
-        """Read back from a file as the shared model, so that equal measurements stay one stack."""
+        """Let pickle return the shared model, so that equal measurements still form one stack after reading."""
         if type(self) is MeasurementModel:
             return _shared_model, (self.components, self.state_names)
         return super().__reduce_ex__(protocol)

@@ -134,7 +134,7 @@ class MotionModel(ABC):
         )
 
     def start_variance(self, name: str) -> float:
-        """Variance of the unobserved entry `name` of a new object. The mean of this entry is 0."""
+        """Return the variance of the entry `name` of a new object that was not observed. Its mean is 0."""
         return 1.0
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:

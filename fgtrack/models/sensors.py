@@ -79,19 +79,18 @@ class Correlation:
     time_s: PositiveFloat = 1.0
     """Correlation time: the autocorrelation of the correlated part falls to 1/e after it."""
     jump_probability: float = Field(0.0, ge=0.0, lt=1.0)
-    """Probability that the whole position error is new.
+    """Probability that the whole position error of a detection has changed since the detection before.
 
-    For instance, the sensor now detects the other end of a hull. Then a detection that
-    a claim refuses still updates a confirmed track without another detection, if a jump
-    is more likely than clutter. See `association.claim_m`.
+    For instance, the sensor now detects the other end of a hull. Then a detection that a claim refuses still updates a
+    confirmed track without another detection, if a jump is more likely than clutter. See `association.claim_m`.
     """
 
 
 @settings
 class Score:
-    """Likelihood ratio of a detection's score: log(p(score | object) / p(score | clutter)) = (score - even) / scale.
+    """Evidence of a detection's score: log(p(score | object) / p(score | clutter)) = (score - even) / scale.
 
-    The logarithm is limited to the range from -10 to 10.
+    This logarithm of the likelihood ratio is limited to the range from -10 to 10.
     """
 
     even: float
@@ -108,7 +107,7 @@ class SensorModel:
     """
 
     std: Mapping[str, PositiveFloat] = field(default_factory=dict)
-    """Standard deviation of each measured component. The keys are the components that the sensor measures.
+    """Standard deviation of each measured component, in the unit of its name; the sensor measures these components.
 
     Empty: a replay assumes it from the recording. A live tracker needs it.
     """
@@ -133,7 +132,11 @@ class SensorModel:
     counter_add: NonNegativeInt = 1
     """Increment of the status counter when a detection of this sensor matches a track."""
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
-    """Range at which a track that this sensor misses loses one count."""
+    """Tracks that lose one count if a list of this sensor misses them (`lifecycle.kind: counting`).
+
+    `always`: all tracks. `short_range`: tracks within `lifecycle.short_range_m` of the ego. `long_range`: tracks beyond
+    this distance. `never`: no track.
+    """
     stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
     """Stamp of a detection.
 
@@ -207,7 +210,7 @@ class SensorModel:
     detection_probability: OpenProbability = 0.9
     """Probability that a list contains an object that is visible to the sensor (`lifecycle.kind: existence`).
 
-    It describes lists between two lists that contain the object. The tracker estimates
+    It applies while the object is visible, as between two lists that contain the object. The tracker itself estimates
     how often objects are hidden, too small or too far away.
     """
     clutter_per_m2: PositiveFloat = 1e-4

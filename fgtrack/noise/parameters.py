@@ -171,7 +171,7 @@ class SensorNoise:
 
     sensor: str
     count: int
-    """Number of innovations that contributed to the likelihood."""
+    """Number of innovations of the sensor that contributed to the likelihood."""
     own_covariance: int
     """Number of innovations to which the sensor's standard deviations do not apply.
 

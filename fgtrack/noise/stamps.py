@@ -34,7 +34,7 @@ class StampFit(NamedTuple):
 
     std_s: float
     std_error: float
-    """Standard error of the logarithm; infinite if the likelihood is flat."""
+    """Standard error of the logarithm of the standard deviation; infinite if the likelihood is flat."""
 
 
 def fitted_stamps(

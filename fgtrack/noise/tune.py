@@ -387,9 +387,9 @@ class _Tuning:
         return values, likelihood, tuple(parameters)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, row: int) -> float:
-        """Return the value of parameter `row` nearest to the configured one that the data do not reject.
+        """Return the value of parameter `row` nearest to its configured value that the data do not reject at 95 %.
 
-        The other parameters keep their `values`.
+        The other parameters keep their `values`, the maximum.
         """
         shares = np.linspace(0.0, 1.0, 41)
         rows = np.broadcast_to(values, (len(shares), len(values))).copy()
@@ -442,9 +442,9 @@ class _Tuning:
     def _scored(
         self, series: Sequence[Series], values: FloatArray
     ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
-        """Return the log-likelihood of each counted innovation, and the squared components over their variances.
+        """Return the log-likelihoods of the counted innovations, and their squared components over the variances.
 
-        The squares are listed by sensor and component.
+        The squares are lists by sensor and component. `values` are the parameters, shape (p,).
         """
         terms = list[float]()
         squares = dict[tuple[str, str], list[float]]()
@@ -475,7 +475,7 @@ class _Tuning:
 
 
 def _identifiability(std_error: float) -> Known:
-    """Return how well a parameter with this relative standard error is known."""
+    """Return `yes`, `roughly` or `no` for a parameter with this relative standard error."""
     if std_error <= _KNOWN:
         return "yes"
     return "roughly" if std_error <= _ROUGHLY_KNOWN else "no"

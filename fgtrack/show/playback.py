@@ -98,14 +98,20 @@ class _Recording:
         return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
 
     def rows(self, states: Columns, time: str, *order: str) -> Columns:
-        """Return the rows of `states` with a position and a time, sorted by `time` and `order`."""
+        """Return the rows of `states` with a finite position and time, sorted by the column `time`, then by the columns
+        `order`.
+        """
         states = with_position(states)
         states = states.where(np.isfinite(self.seconds(states[time])))
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
         return Columns({name: values[keys] for name, values in states.items()})
 
     def columns(self, states: Columns, time: str) -> Json:
-        """Return times and poses of rows, and the half axes of their 95 % ellipses if they have covariances."""
+        """Return the columns of the viewer for rows of `states`: times, positions, and yaws if there are any.
+
+        If the rows have covariances, the half axes and directions of the 95 % ellipses are added. `time` is the column
+        with the times.
+        """
         columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS)}
         columns |= {name: _column(states[f"{name}_m"]) for name in "xy"}
         if "yaw_rad" in states:
@@ -119,7 +125,10 @@ class _Recording:
         return columns
 
     def values(self, notes: dict[str, None], most: int) -> Json:
-        """Return map, ego and truth."""
+        """Return map, ego and truth for the viewer, at most about `most` rows each.
+
+        A line for each content that is left out or thinned is added to `notes`.
+        """
         run = self.runs[0].run
         maps, gone = roads(run)
         notes.update(dict.fromkeys(gone))
@@ -150,7 +159,10 @@ class _Recording:
         }
 
     def run(self, one: EvaluatedRun, notes: dict[str, None], most: int) -> Json:
-        """Return ticks, tracks, the past of the tracks at every tick, final states and detections."""
+        """Return the ticks of a run, its tracks and their past at every tick, its final states and its detections.
+
+        A line for each thinned table is added to `notes`.
+        """
         tables = one.run.tables
         lagged = tables["lagged"]
         smoothed = tables["smoothed"]
@@ -226,10 +238,10 @@ def _place(position_m: FloatArray, prefix: str = "") -> Json:
 def _thinned(
     tables: Sequence[Columns], time: str, most: int, label: str, notes: dict[str, None]
 ) -> list[Columns]:
-    """Return `tables`, thinned to every k-th time of the first table, so that about `most` rows remain.
+    """Return `tables`, thinned to every k-th distinct time of the first table, so that about `most` rows remain.
 
-    Tables with at most `most` rows are returned unchanged. A note on the thinning is added
-    to `notes`.
+    `time` is the column with the times. If no table has more than `most` rows, all are returned unchanged. A line on
+    the thinning of `label` is added to `notes`.
     """
     num_rows = max(item.num_rows for item in tables)
     step = max(1, math.ceil(num_rows / most))

@@ -20,9 +20,10 @@ _DEFAULT_LAG_S = 1.0
 
 
 def ellipses(states: Columns, deviations: float) -> FloatArray:
-    """Half axes (long, short) and direction in [0, pi) of position ellipses, shape (n, 3).
+    """Return half axes (long, short) in m and direction in [0, pi) of the position ellipses, shape (n, 3).
 
-    The half axes are `deviations` standard deviations long. NaN without a covariance.
+    The half axes are `deviations` standard deviations long. The direction is that of the long axis. NaN without a
+    covariance.
     """
     xx, xy, yy = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
     covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
@@ -84,7 +85,7 @@ def start_ns(run: Run) -> int:
 
 
 def groups(keys: IntArray) -> Iterator[tuple[int, IntArray]]:
-    """Yield each value of `keys` (n,) in ascending order, with its rows in their order."""
+    """Yield each value of `keys` (n,) in ascending order, with the indices of its rows in ascending order."""
     order = np.argsort(keys, kind="stable")
     values, starts = np.unique(keys[order], return_index=True)
     if len(values):

@@ -170,10 +170,11 @@ class DenseRule(NamedTuple):
 
 
 def _equidistant(spread_rad: float) -> tuple[FloatArray, FloatArray]:
-    """Equidistant points of a standard Gaussian with variance 1, and their weights.
+    """Return equidistant points (m,) of the standard normal distribution, and their weights (m,).
 
-    A unit is `spread_rad`; neighbouring points are at most a radian apart. No point lies at the mean. Beyond the
-    sensor, a point at the mean would see the sensor at half a turn, with either sign.
+    A standard deviation changes the angle by `spread_rad`. Neighbouring points are at most a radian of this angle
+    apart. No point lies at the mean. Beyond the sensor, a point at the mean would see the sensor at half a turn, with
+    either sign.
     """
     step, num = min(1.0, 1.0 / spread_rad), math.ceil(_REACH * max(1.0, spread_rad))
     at = step * (np.arange(-num, num) + 0.5)

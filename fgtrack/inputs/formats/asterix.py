@@ -346,8 +346,8 @@ def _timed(
 ) -> Iterator[_Timed]:
     """Yield the target reports of `file` that have a stamp and are measured, in the order of the file.
 
-    A time of day is set on the day nearest to the report before, and the receipt on the
-    day nearest to the stamp: it may lie before the stamp, because both are rounded.
+    A time of day gets the day on which it is nearest to the stamp of the report before. A receipt gets the day on which
+    it is nearest to its stamp. The receipt may lie before the stamp, because both are rounded.
     """
     before_ns: int | None = None
     for number, record in _records(file, readers):
@@ -472,7 +472,7 @@ def _position_m(
 def _velocity(
     record: Record, item: str, first: str, second: str
 ) -> tuple[float | None, float | None]:
-    """Return speed over ground and course; None if not reported. The course of an object at rest is None."""
+    """Return speed over ground and course; both None if not reported. The course of an object at rest is None."""
     a = record.get(f"{item}/{first}")
     b = record.get(f"{item}/{second}")
     if a is None or b is None:

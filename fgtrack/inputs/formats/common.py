@@ -71,8 +71,8 @@ def json_values(
 ) -> Iterator[Any]:  # Any: parsed JSON
     """Yield the values of the list that follows `begin` in the JSON `file`; for an object, keys and values in turn.
 
-    A table may have a gigabyte. `form` contains arguments of `JSONDecoder`. Raises
-    `DataError` for a file of another form.
+    The file is read piece by piece, because a table may have a gigabyte. `form` contains arguments of `JSONDecoder`.
+    Raises `DataError` for a file of another form.
     """
     with reported_as(
         f"{file}: is not JSON of the expected form, download the file once more"
@@ -162,7 +162,10 @@ def yaw_rad(orientation: RosMessage) -> float | None:
 
 
 def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) -> float:
-    """Length of the velocity, negative if it points against the heading; both are in the same frame."""
+    """Return the length of the velocity, negative if the velocity points against the heading.
+
+    Velocity and heading are in the same frame. Without a heading the speed is positive.
+    """
     speed = math.hypot(vx_mps, vy_mps)
     if heading_rad is None:
         return speed
@@ -172,7 +175,7 @@ def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) ->
 
 @np.errstate(all="ignore")  # the tracker counts values that are not finite
 def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
-    """Gradient, shape (2,), of the speed by the velocity; the x axis at velocity 0."""
+    """Gradient, shape (2,), of the speed by the velocity; (1, 0) at velocity 0."""
     speed = math.hypot(vx_mps, vy_mps)
     return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
 
@@ -184,11 +187,12 @@ def covariance(
     twist: FloatArray | None = None,
     velocity: Any = None,
 ) -> tuple[float, ...] | None:
-    """Row-major covariance of the measured `values` (position, yaw, speed); None if it does not cover all of them.
+    """Row-major covariance of the measured components, in the order of `MEASURABLE`.
 
-    `pose` is the covariance of x, y and yaw, shape (3, 3). `twist` begins with the
-    covariance of `velocity`; the variance of the speed follows to first order. None
-    means unknown.
+    `values` are the measured position, yaw and speed; a component that is None is not measured. `pose` is the
+    covariance of x, y and yaw, shape (3, 3). `twist` begins with the covariance of `velocity`; the variance of the
+    speed follows to first order. `pose` and `twist` are None if unknown. Returns None if a variance is unknown: 0 or
+    less.
     """
     if pose is None:
         return None

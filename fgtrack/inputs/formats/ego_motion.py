@@ -43,7 +43,7 @@ class EgoMotion:
         self._turned: EgoState | None = None
 
     def completed(self, state: EgoState) -> EgoState:
-        """Return `state` with the missing components."""
+        """Return `state` with the missing components, computed from this state and the states before."""
         if not self._missing:
             return state
         if "yaw_rad" in self._missing:
@@ -115,10 +115,9 @@ class EgoMotion:
 
 
 def missing_motion(given: Collection[str]) -> tuple[str, ...]:
-    """Return the components to compute from poses if only the components `given` are measured.
+    """Return the names of heading, speed and yaw rate that must be computed, because `given` lacks them.
 
-    A yaw rate is computed only together with heading or speed; a recording that
-    measures both needs none.
+    If only the yaw rate is missing, it is not computed.
     """
     missing = tuple(name for name in MOTION if name not in given)
     return () if missing == MOTION[2:] else missing

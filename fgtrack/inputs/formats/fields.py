@@ -77,7 +77,11 @@ def is_relative_velocity(fields: Mapping[str, FieldPath]) -> bool:
 def _along_sight(
     path: FieldPath, values: Mapping[str, Any], read: Callable[[str], Any]
 ) -> float | None:
-    """Component of a relative velocity along the line of sight; None if the velocity or the direction is missing."""
+    """Return the component of a relative velocity along the line of sight, positive away from the sensor.
+
+    `path` names the two components of the velocity, and `values` contain position or bearing. None if the velocity or
+    the direction is missing.
+    """
     paths = paths_of(path)
     if len(paths) != 2:
         raise FieldError(f"{paths}: range_rate_mps needs one path, or two for x and y")
@@ -102,7 +106,7 @@ def paths_of(path: FieldPath) -> list[str]:
 
 
 def single_path(path: FieldPath) -> str:
-    """Path of the recorded field of a component that is not a number; raises `FieldError` for several paths."""
+    """Return the path of a component that is read from one field; raises `FieldError` for several paths."""
     paths = paths_of(path)
     if len(paths) != 1:
         raise FieldError(f"{paths}: a single field is needed, name one of them")
@@ -110,10 +114,10 @@ def single_path(path: FieldPath) -> str:
 
 
 def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
-    """Read and convert a component.
+    """Return the component `name` of the value at `path`, converted; None if the value is missing or unknown.
 
-    An angle is wrapped if it was converted. Above 1.5 turns it is wrapped only if
-    `degrees` is set, because it may be in degrees.
+    An angle is wrapped only if it was converted. If only an offset was added, an angle above 1.5 turns is not wrapped,
+    because it may be in degrees.
     """
     if name in _CONVERSIONS:
         value = read(single_path(path))
@@ -176,8 +180,7 @@ def items_by_fields(
 ) -> list[RosMessage]:
     """Return the recorded objects of `message`, in the order of `objects_by_fields`.
 
-    The path of the objects may lead through lists; then the objects of all their items
-    are returned.
+    The path of the objects may lead through lists. Then the objects in all items of these lists are returned.
     """
     if "objects" not in fields:
         return [message]
@@ -191,8 +194,8 @@ def items_by_fields(
 def _items_at(message: RosMessage, parts: Sequence[str]) -> list[RosMessage] | None:
     """Return the items of the list at the path `parts`; None if the path ends at no list.
 
-    A list on the path is followed in each of its items. If such a path ends at no list,
-    it has no items.
+    A list on the path stands for each of its items, unless an index follows. An item whose path ends at no list then
+    adds nothing.
     """
     value = message
     for number, part in enumerate(parts):

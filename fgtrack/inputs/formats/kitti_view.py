@@ -91,7 +91,10 @@ class View(NamedTuple):
     def pose(
         self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float
     ) -> tuple[FloatArray, float]:
-        """Position (3,) and yaw in the ego frame of an object in the rectified camera frame."""
+        """Return position (3,) and yaw, in the ego frame, of an object in the rectified camera frame.
+
+        `rotation_y_rad` is the rotation about the camera's y axis, as in the labels.
+        """
         heading = [math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)]
         return self.position_m([x_m, y_m, z_m]), self._azimuth_rad(heading)
 

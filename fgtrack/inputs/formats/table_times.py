@@ -19,7 +19,7 @@ class WrongTimeError(FieldError):
 
 @dataclass
 class Day:
-    """Newest time of day of an input, which gives the day of the next time of day; None before the first."""
+    """Newest time of day of an input. The next time of day gets the day on which it is nearest to this time."""
 
     newest_ns: int | None = None
 
@@ -58,7 +58,11 @@ class TableTimes:
         return times_ns["stamp"], times_ns["receipt"]
 
     def _on_day(self, time_ns: int, other_ns: int, other: str) -> int:
-        """Return a time of day on the day of the row's other time, or else on the day of the time before."""
+        """Return the time of day `time_ns` of a row with its day.
+
+        If the row's other time has a date, the day is the one nearest to it. Else it is the day nearest to the newest
+        time of the input.
+        """
         form = self._forms[other]
         if form is None or not form.is_of_day:
             return on_nearest_day(time_ns, other_ns)

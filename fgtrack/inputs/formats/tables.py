@@ -56,8 +56,9 @@ from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
 
 _ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
-#: Endings of other texts, which are tables if their content is one, and the largest number of them in a folder.
+#: Other endings of file names. A file with such an ending is a table if its content is a table.
 _TEXT_ENDINGS = (".txt", ".dat", ".asc", ".tum")
+#: Largest number of files with such an ending in a folder of tables.
 _MOST_TEXTS = 50
 #: Rows from which the form of dates is inferred.
 _SAMPLES = 1000

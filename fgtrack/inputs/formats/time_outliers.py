@@ -14,7 +14,7 @@ WRONG_TIME = "wrong time"
 #: Times are compared with this number of neighbours, of which some on both sides of the range may be wrong too.
 _NEIGHBOURS = 20
 _WRONG = 2
-#: A time is wrong if it differs from the range of its neighbours by this number of ranges, and by so many s besides.
+#: A time is wrong if it lies outside the range of its neighbours by more than this number of ranges plus a margin in s.
 _RANGES = 5.0
 _AHEAD_S = 60.0
 _BEHIND_S = float(DAY_S)
@@ -24,11 +24,11 @@ _Item = TypeVar("_Item")
 
 
 def outliers(times_s: FloatArray, behind_s: float = _BEHIND_S) -> BoolArray:
-    """Return, for each of the times, shape (n,), True if it does not fit its neighbours; NaN is no time.
+    """Return a mask of the wrong times among `times_s`, shape (n,); NaN stands for a missing time, which is not wrong.
 
-    A time is wrong if it is far ahead of its neighbours, compared with the range of the
-    neighbours' times, or `behind_s` behind them. Late reports of a satellite are
-    behind, and not wrong.
+    A time is wrong if it is more than a minute and five ranges after its neighbours, or more than `behind_s` and five
+    ranges before them. The range is that of the neighbours' times. Reports that a satellite delivers late are earlier
+    than their neighbours, but not by so much.
     """
     present = np.flatnonzero(~np.isnan(times_s))
     is_wrong = np.zeros(len(times_s), dtype=bool)

@@ -88,7 +88,7 @@ class Likelihood:
         return values
 
     def totals(self, values: FloatArray) -> FloatArray:
-        """Return the log-likelihood of all counted innovations for each parameter vector, (b, p) -> (b,)."""
+        """Return the log-likelihood of all counted innovations together, shape (b,), for parameter vectors (b, p)."""
         return np.asarray(
             self._innovations.evaluate(values).log_likelihoods.sum(axis=1)
         )
@@ -98,7 +98,7 @@ class Likelihood:
         return self._cost(logs.tobytes())
 
     def stop_where_flat(self, logs: FloatArray) -> None:
-        """Raise `StopIteration` if the next step would hardly raise the log-likelihood."""
+        """Raise `StopIteration` if the next step would raise the log-likelihood by less than `_LEAST_GAIN`."""
         cost = self.cost(logs)
         if (
             float(cost.gradient @ psd_solve(cost.information, cost.gradient))
@@ -189,12 +189,15 @@ class Likelihood:
 
 
 def _difference(values: FloatArray) -> FloatArray:
-    """Return derivatives (f, ...) from values (f + 1, ...): at a point, then shifted in each direction."""
+    """Return derivatives (f, ...) by f variables.
+
+    `values` (f + 1, ...) are those at a point, and at the f points that are shifted by `_DIFFERENCE` in a variable.
+    """
     return np.asarray((values[1:] - values[0]) / _DIFFERENCE)
 
 
 def _expected(evaluation: Evaluation) -> FloatArray:
-    """Return the expected information of normal innovations, shape (f, f)."""
+    """Return the expected information on the free logarithms, shape (f, f), if the innovations are normal."""
     dy, dS = _difference(evaluation.y), _difference(evaluation.S)
     solved = psd_solve(evaluation.S[:1], np.concatenate([dS, dy[..., None]], axis=-1))
     A = solved[..., :-1]

@@ -162,9 +162,11 @@ class Innovations:
     def _transitions(
         self, values: FloatArray, block: slice
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return F, drift and Q of a `block` of steps, for each parameter vector.
+        """Return F (..., n, n), drift (..., n) and Q (..., n, n) of a `block` of steps, for each parameter vector in
+        `values`.
 
-        The drift is the difference between the prediction and the reference prediction.
+        The drift is the prediction minus the reference prediction. If only Q depends on the parameters, F and drift
+        have a first axis of length 1, and the drift is 0.
         """
         if self._parts is not None:
             rest, parts = self._parts

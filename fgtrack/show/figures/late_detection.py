@@ -162,7 +162,10 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
 def _estimates(
     tracker: MultiObjectTracker, track_id: int, stamps_ns: Iterable[int]
 ) -> Estimates:
-    """Return the states at the descending `stamps_ns`, back to the start of the track's window."""
+    """Return the states of a track at the descending `stamps_ns`, up to the first stamp before its window.
+
+    The result is in ascending order.
+    """
     states = []
     for stamp_ns in stamps_ns:
         try:
@@ -179,15 +182,14 @@ def _estimates(
 def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, str]:
     """Return a typical out-of-sequence detection that every run fused, and a sentence on the choice.
 
-    Candidates lower the present error of the first run. Their errors are the error
-    before the fusion in the first run, and the errors after it in all runs. The chosen
-    detection has the errors nearest to their root mean squares; the largest ratio of
-    the errors counts. It lies in the first 20 s if possible. Without truth, it is the
-    detection that moves the present by the median distance. With `stamp_ns` it is the
-    one with the nearest stamp.
+    With `stamp_ns` it is the detection with the nearest stamp. Otherwise the candidates are the detections that lower
+    the error of the present in the first run. Each has the error before the fusion in the first run, and the errors
+    after the fusion in all runs. The chosen detection has errors near their root mean squares: its largest ratio to
+    them is the smallest. It lies in the first 20 s if possible. If no detection lowers the error, or without truth, it
+    is the detection that moves the present by the median distance.
 
-    Ticks in which a track fused several detections are excluded, and tracks with fewer
-    than twenty measurements. Raises `DataError` if there is no candidate.
+    Ticks in which a track fused several detections are excluded, and tracks with fewer than twenty measurements. Raises
+    `DataError` if there is no such detection.
     """
     first, *others = (_late_detections(run) for run in runs)
     late = first[
@@ -235,10 +237,10 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
 
 
 def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
-    """Return the late detections that a settled track fused alone in a tick, indexed by `_DETECTION`.
+    """Return a table of the late detections that a track fused alone in a tick, indexed by `_DETECTION`.
 
-    Columns [m] are the shift of the present from its prediction, and its errors before
-    and after; NaN without truth.
+    The track has fused at least `_SETTLED` detections. Columns in metres: `moved_m`, the distance of the present from
+    its prediction, and `before_m` and `after_m`, the errors before and after the fusion. They are NaN without truth.
     """
     both = ["tick", "track_id"]
     fused = run.updates[run.updates["disposition"].isin(FUSED[1:])]
