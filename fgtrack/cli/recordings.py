@@ -19,16 +19,18 @@ from fgtrack.cli.arguments import (
     StorageOption,
 )
 from fgtrack.cli.show import console, progress, say
+from fgtrack.config.keys import commented
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.shipped import Kind, shipped, summary
 from fgtrack.config.yaml_file import dump, load
+from fgtrack.core.errors import CallError
 from fgtrack.core.output import check_no_overlap
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.inputs.recording import check_recording, write_recording
+from fgtrack.pipeline.simulation import path_files, simulated
 from fgtrack.sim.new_delays import SensorDelays, redelay
-from fgtrack.sim.simulate import simulate as simulated
 
 
 def simulate(
@@ -50,7 +52,7 @@ def simulate(
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
     scenario = read_scenario(scenario_file, duration_s=duration_s)
-    check_no_overlap(out, [scenario_file, scenario.map])
+    check_no_overlap(out, [scenario_file, scenario.map, *path_files(scenario)])
     check_recording(out, overwrite)
     with progress("simulate"):
         messages = simulated(scenario, np.random.default_rng(seed))
@@ -114,12 +116,31 @@ def _with_unread(
 def config(
     config_file: ConfigFile = None,
     settings: Settings = None,
+    scenario_name: Annotated[
+        str | None,
+        Option(
+            "--scenario",
+            metavar="SCENARIO",
+            help="Print a scenario instead: a file (YAML) or a shipped name.",
+        ),
+    ] = None,
     listed: Annotated[
         bool,
         Option("--list", help="List the shipped configurations, scenarios and sweeps."),
     ] = False,
 ) -> None:
-    """Print the resolved configuration, or list the shipped ones."""
+    """Print the resolved configuration or a scenario, or list the shipped ones.
+
+    A scenario is printed with the meaning and the default of each key. The printed text
+    is a scenario file.
+    """
+    if scenario_name is not None:
+        if config_file is not None or settings or listed:
+            raise CallError(
+                "--scenario: prints a scenario alone, give it without other options"
+            )
+        say(commented(read_scenario(scenario_name)).removesuffix("\n"))
+        return
     if not listed:
         say(dump(read_config(config_file, settings)).removesuffix("\n"))
         return

@@ -32,10 +32,10 @@ from fgtrack.evaluation.diagnostics import (
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import with_origin
+from fgtrack.pipeline.simulation import simulated
 from fgtrack.recording_study import Study, outputs
 from fgtrack.recording_study import study as studied
 from fgtrack.show.figures.plot import error_against_delay
-from fgtrack.sim.simulate import simulate
 
 
 def study(
@@ -179,7 +179,7 @@ def demo(
         bag = out / "recording"
         check_recording(bag, overwrite)
         with progress("simulate"):
-            messages = simulate(scenario, np.random.default_rng(seed))
+            messages = simulated(scenario, np.random.default_rng(seed))
             write_recording(
                 bag, messages, overwrite=overwrite, settings=recorded_of(scenario)
             )

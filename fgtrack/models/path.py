@@ -1,4 +1,4 @@
-"""A smooth closed path: position, heading and curvature with their exact derivatives."""
+"""A smooth path, closed or open: position, heading and curvature with their exact derivatives."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -33,12 +33,19 @@ class PathFrame:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Periodic cubic spline through points. Its parameter u is the arc length along the chords."""
+    """Cubic spline through points. Its parameter u is the arc length along the chords.
+
+    A closed path is periodic. An open path goes straight on beyond its two ends.
+    """
 
     u_m: FloatArray
-    """Parameters of the points, shape (n + 1,), from 0 to the length of the lap."""
+    """Parameters of the points, shape (n + 1,), from 0 to the length of the lap.
+
+    An open path has two additional points, on the straight lines beyond its ends.
+    """
     coefficients: FloatArray
     """Position and its three derivatives at the start of each piece, shape (4, n, 2)."""
+    is_closed: bool = True
 
     @classmethod
     def through(cls, points_m: FloatArray) -> Self:
@@ -64,14 +71,34 @@ class Path:
         )
         return cls(np.concatenate([[0.0], np.cumsum(h)]), np.array(coefficients))
 
+    @classmethod
+    def open_through(cls, points_m: FloatArray) -> Self:
+        """Return the open path through `points_m`, shape (n, 2); its curvature is 0 at both ends."""
+        from scipy.interpolate import CubicSpline
+
+        steps_m = np.hypot(*np.diff(points_m, axis=0).T)
+        u_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        spline = CubicSpline(u_m, points_m, bc_type="natural")
+        inside = spline.c[::-1] * np.array([1.0, 1.0, 2.0, 6.0])[:, None, None]
+        still = np.zeros(2)
+        first = spline(u_m[0], 1)
+        last = spline(u_m[-1], 1)
+        before = np.array([points_m[0] - first, first, still, still])[:, None]
+        after = np.array([points_m[-1], last, still, still])[:, None]
+        return cls(
+            np.concatenate([[-1.0], u_m, [u_m[-1] + 1.0]]),
+            np.concatenate([before, inside, after], axis=1),
+            is_closed=False,
+        )
+
     @property
     def length_m(self) -> float:
-        """Length of the lap along the chords."""
+        """Length of the lap of a closed path along the chords."""
         return float(self.u_m[-1])
 
     def frame(self, u_m: FloatArray) -> PathFrame:
         """Moving frame at the parameters `u_m`, shape (n,); parameters of any lap are valid."""
-        lap_m = np.mod(u_m, self.length_m)
+        lap_m = np.mod(u_m, self.length_m) if self.is_closed else u_m
         piece = np.searchsorted(self.u_m[1:-1], lap_m, side="right")
         t = (lap_m - self.u_m[piece])[:, None]
         p0, p1, p2, p3 = self.coefficients[:, piece]

@@ -16,9 +16,9 @@ from fgtrack.inputs.recording import Storage, check_recording, write_recording
 from fgtrack.inputs.validation import InvalidMessageError, validated_message
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
+from fgtrack.pipeline.simulation import simulated
 from fgtrack.runs import Run, load_run
 from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.simulate import simulate as simulated
 
 
 def replay(

@@ -27,11 +27,11 @@ from fgtrack.core.types import Message
 from fgtrack.meaning.assumed import assumed
 from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.pipeline.simulation import simulated
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
 from fgtrack.runs import Run
 from fgtrack.sim.new_delays import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.simulate import simulate
 
 SWEEP_TABLE = "sweep.csv"
 TIMING_TABLE = "timing.csv"
@@ -232,7 +232,9 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         config = validate(Config, recipe["config"], "config")
         rng = np.random.default_rng(recipe["seed"])
         if recipe["recording"] is None:
-            messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
+            messages = simulated(
+                validate(Scenario, recipe["scenario"], "scenario"), rng
+            )
         else:
             draft = opened(recipe["recording"], config)
             source = draft.source

@@ -29,6 +29,7 @@ from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import versions
+from fgtrack.pipeline.simulation import path_files
 from fgtrack.sim.new_delays import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
@@ -335,6 +336,13 @@ def _jobs(
         if recorded is not None:
             read["messages"], settings = recorded.read(valid[CONFIG].input)
             texts += texts_of(plain(settings))
+        else:
+            # A recording's folder is hashed by its messages, a file by its content.
+            read["paths"] = {
+                name: _Recorded(Path(name)).read(InputConfig())[0]
+                for name in path_files(valid[SCENARIO])
+                if os.path.isdir(name)
+            }
         read["files"] = {
             text: _sha256(_content(text)) for text in texts if os.path.isfile(text)
         }

@@ -27,11 +27,13 @@ _HOMES = {
     "OffsetClock": "fgtrack.sim.clocks",
     "QuantisedClock": "fgtrack.sim.clocks",
     "RADAR_DELAY": "fgtrack.sim.delays",
+    "RecordedVehicle": "fgtrack.sim.roads",
     "Scenario": "fgtrack.sim.scenario",
     "SensorDelays": "fgtrack.sim.new_delays",
     "SimulatedSensor": "fgtrack.sim.sensor",
     "TrackVehicle": "fgtrack.sim.vehicles",
     "UniformDelay": "fgtrack.sim.delays",
+    "WaypointVehicle": "fgtrack.sim.roads",
     "draw_delays": "fgtrack.sim.delays",
     "draw_states": "fgtrack.sim.vehicles",
     "redelay": "fgtrack.sim.new_delays",
@@ -59,6 +61,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.sim.new_delays import SensorDelays as SensorDelays
     from fgtrack.sim.new_delays import redelay as redelay
     from fgtrack.sim.new_delays import restamped as restamped
+    from fgtrack.sim.roads import RecordedVehicle as RecordedVehicle
+    from fgtrack.sim.roads import WaypointVehicle as WaypointVehicle
     from fgtrack.sim.scenario import EgoMessages as EgoMessages
     from fgtrack.sim.scenario import Scenario as Scenario
     from fgtrack.sim.sensor import Clutter as Clutter

@@ -41,6 +41,7 @@ class JitterClock:
     """Each stamp has an independent normal error."""
 
     std_s: Annotated[float, Field(ge=0.0, le=_LARGEST_ERROR_S)]
+    """Standard deviation of the error of a stamp."""
     kind: Literal["jitter"] = "jitter"
 
 
@@ -49,6 +50,7 @@ class QuantisedClock:
     """A clock with a coarse resolution: stamps are rounded down to a multiple of the step."""
 
     step_s: Annotated[float, Field(ge=1e-9, le=_LARGEST_ERROR_S)]
+    """Resolution of the clock."""
     kind: Literal["quantised"] = "quantised"
 
 

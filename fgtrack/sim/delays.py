@@ -27,6 +27,7 @@ class ConstantDelay:
     """All messages have the same delay."""
 
     delay_s: NonNegativeFloat
+    """Delay of every message."""
     kind: Literal["constant"] = "constant"
 
 
@@ -35,7 +36,9 @@ class UniformDelay:
     """Delays are uniform between two limits."""
 
     min_s: NonNegativeFloat
+    """Smallest delay."""
     max_s: NonNegativeFloat
+    """Largest delay."""
     kind: Literal["uniform"] = "uniform"
 
     def __post_init__(self) -> None:
@@ -53,8 +56,11 @@ class GammaDelay:
     """
 
     min_s: NonNegativeFloat
+    """Smallest delay."""
     mean_s: float
+    """Mean delay."""
     q90_s: float
+    """90 % quantile of the delay."""
     kind: Literal["gamma"] = "gamma"
 
     def __post_init__(self) -> None:
@@ -94,6 +100,7 @@ class LossyDelay:
     """Each message is lost with `probability`; the others have delays of the model `base`."""
 
     probability: Probability
+    """Probability that a message is lost."""
     base: "AnyDelay" = field(default_factory=NoDelay)
     kind: Literal["loss"] = "loss"
 
@@ -112,7 +119,9 @@ class MarkovDelay:
     good: "AnyDelay"
     bad: "AnyDelay"
     to_bad: Probability
+    """Probability that a bad message follows a good one."""
     to_good: Annotated[float, Field(gt=0.0, le=1.0)]
+    """Probability that a good message follows a bad one."""
     kind: Literal["markov"] = "markov"
 
 
@@ -128,7 +137,9 @@ class MarkovTimeDelay:
     good: "AnyDelay"
     bad: "AnyDelay"
     to_bad_per_s: NonNegativeFloat
+    """Rate at which a good link turns bad."""
     to_good_per_s: PositiveFloat
+    """Rate at which a bad link turns good."""
     kind: Literal["markov_time"] = "markov_time"
 
 

@@ -83,6 +83,7 @@ class Scanner:
         sensor = self.sensor
         n = len(states)
         everything = np.arange(n)
+        # The states of an object are NaN while it is absent; comparisons with NaN are false.
         seen = self._visible(everything, states) & (
             rng.random(n) < sensor.detection_probability
         )

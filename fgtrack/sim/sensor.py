@@ -29,6 +29,7 @@ class Clutter:
     the maximum range.
     """
     region: Literal["field_of_view", "track"] = "field_of_view"
+    """Region of the false detections."""
     speed_mps: tuple[float, float] = (0.0, 0.0)
     """Smallest and largest speed of clutter, along the track or in any direction."""
 
@@ -50,9 +51,11 @@ class SimulatedSensor:
     """
 
     name: Annotated[str, Field(min_length=1)]
+    """Name of the sensor in the recording."""
     std: Mapping[str, NonNegativeFloat]
     """Standard deviation of each measured component; x_m is along, y_m across the line of sight."""
     rate_hz: Rate = 20.0
+    """Rate of the scans."""
     phase_s: NonNegativeFloat = 0.0
     """Time of the first scan."""
     jitter_s: NonNegativeFloat = 0.0
@@ -63,15 +66,20 @@ class SimulatedSensor:
     field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] = math.tau
     """Full angle of view, centred on the sensor's axis."""
     min_range_m: NonNegativeFloat = 0.0
+    """Range below which the sensor sees nothing."""
     max_range_m: float = 100.0
+    """Range beyond which the sensor sees nothing."""
     max_range_behind_m: float | None = None
     """Maximum range in the rear half, if it is shorter; null means `max_range_m`."""
     detection_probability: Probability = 1.0
+    """Probability that an object in view is detected in a scan."""
     clutter: Clutter = field(default_factory=Clutter)
     split_probability: Probability = 0.0
     """Probability that a detected object causes two detections, one behind the other."""
     split_distance_m: tuple[NonNegativeFloat, NonNegativeFloat] = (2.0, 4.0)
+    """Smallest and largest distance between the two detections of a split object."""
     outlier_probability: Probability = 0.0
+    """Probability that a detection is an outlier."""
     outlier_factor: Annotated[float, Field(ge=1.0)] = 10.0
     """Factor on the standard deviations of an outlier."""
     drop_outs: tuple[tuple[float, float], ...] = ()

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
@@ -25,25 +26,43 @@ from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.clocks import reported_stamps
 from fgtrack.sim.delays import AnyDelay, draw_delays
+from fgtrack.sim.roads import (
+    AnyVehicle,
+    RecordedVehicle,
+    TimedPath,
+    WaypointVehicle,
+)
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle
+from fgtrack.sim.vehicles import DrawnVehicle
 
 States = Callable[[FloatArray], FloatArray]
-"""Returns the true states of a vehicle, shape (n, 6), at times since the start, shape (n,)."""
+"""Returns the true states of a vehicle, shape (n, 6), at times since the start, shape (n,); NaN while it is absent."""
+PathReader = Callable[[RecordedVehicle], TimedPath]
+"""Reads the path of a recorded vehicle."""
 
 
-def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
+def _no_paths(vehicle: RecordedVehicle) -> TimedPath:
+    raise CallError(
+        f"{vehicle.file}: a recorded path is read by `fgtrack.simulate` alone"
+    )
+
+
+def simulate(
+    scenario: Scenario, rng: np.random.Generator, read_path: PathReader = _no_paths
+) -> list[Message]:
     """Return the messages of `scenario` in order of receipt; at equal receipts the truth, the ego, then the sensors.
 
     Every vehicle and every sensor has its own random generators. A sensor has separate
     generators for delays, clock errors, clutter and the detections of each object. So a
     change of a sensor, a delay or a clock model leaves the other draws unchanged. A
     clock model changes the reported stamp, never the measurement. Lost messages are
-    left out.
+    left out, and so is a vehicle before and after its recorded path. `read_path` reads
+    recorded paths.
 
-    Raises `DataError` if the map cannot be read.
+    Raises `DataError` if the map or a path cannot be read, and if the ego's recorded path
+    does not cover the whole duration.
     """
     vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)
     track = None
@@ -52,11 +71,16 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     path = None if track is None else Path.through(track.table[:, :2])
     vehicles = (scenario.ego, *scenario.opponents)
     ego, *opponents = (
-        _states_of(vehicle, path, child, scenario.duration_s)
+        _states_of(vehicle, path, child, scenario.duration_s, read_path)
         for vehicle, child in zip(
             vehicles, vehicles_rng.spawn(len(vehicles)), strict=True
         )
     )
+    if np.isnan(ego(np.array([0.0, scenario.duration_s]))).any():
+        raise DataError(
+            f"ego: its recorded path must cover the scenario from 0 to {scenario.duration_s:g} s, "
+            "change start_s or duration_s"
+        )
     messages: list[Message] = [
         *_truth(scenario, [ego, *opponents]),
         *_ego_messages(scenario, ego, ego_rng),
@@ -70,10 +94,18 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
 
 
 def _states_of(
-    vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float
+    vehicle: AnyVehicle,
+    path: Path | None,
+    rng: np.random.Generator,
+    duration_s: float,
+    read_path: PathReader,
 ) -> States:
     if isinstance(vehicle, DrawnVehicle):
         return vehicle.trajectory(rng, duration_s).states
+    if isinstance(vehicle, WaypointVehicle):
+        return vehicle.states
+    if isinstance(vehicle, RecordedVehicle):
+        return read_path(vehicle).states
     assert path is not None, "`Scenario` requires a map for a vehicle on a track"
     return partial(vehicle.states, path)
 
@@ -85,6 +117,7 @@ def _truth(scenario: Scenario, vehicles: Sequence[States]) -> list[Message]:
         TruthState(stamp_ns, stamp_ns, object_id, *states[index])
         for index, stamp_ns in enumerate(stamps_ns.tolist())
         for object_id, states in enumerate(rows, start=EGO_ID)
+        if not math.isnan(states[index][0])
     ]
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.settings import require, settings
@@ -22,8 +22,13 @@ class LaneChange:
     start_s: NonNegativeFloat
     """Time at which the lane change starts."""
     duration_s: PositiveFloat
+    """Time from the start to the end of the lane change."""
     lateral_m: float
     """Lateral offset at the end, positive to the left of the reference line."""
+
+
+SpeedKnots = Annotated[tuple[tuple[float, NonNegativeFloat], ...], Field(min_length=1)]
+"""Knots (time [s], speed [m/s])."""
 
 
 @settings
@@ -32,7 +37,7 @@ class TrackVehicle:
 
     arc_m: float
     """Arc length along the reference line at the start."""
-    speed: Annotated[tuple[tuple[float, PositiveFloat], ...], Field(min_length=1)]
+    speed: SpeedKnots
     """Knots (time [s], speed along the reference line [m/s]); the speed is smooth between them and constant outside."""
     lateral_m: float = 0.0
     """Lateral offset at the start, positive to the left."""
@@ -62,7 +67,7 @@ class TrackVehicle:
         and the scale g is in metres of path per unit of u. A prime is the derivative by
         u. Then the velocity is w = u1 (g - d psi') along the tangent and d1 across it,
         and yaw = psi + atan2(d1, w). Yaw rate and acceleration along the heading are
-        the exact derivatives of yaw and speed.
+        the exact derivatives of yaw and speed. A vehicle at rest points along the path.
         """
         u, u1, u2 = self._along(times_s)
         d, d1, d2 = self._across(times_s)
@@ -73,14 +78,16 @@ class TrackVehicle:
             u1 * (frame.scale_rate - d * frame.turn_rate) - d1 * frame.turn
         )
         speed = np.hypot(w, d1)
+        # A vehicle at rest neither turns nor accelerates.
+        divisor = np.where(speed > 0.0, speed, 1.0)
         return np.stack(
             [
                 frame.x_m - d * np.sin(frame.heading_rad),
                 frame.y_m + d * np.cos(frame.heading_rad),
                 wrap_angles(frame.heading_rad + np.arctan2(d1, w)),
                 speed,
-                frame.turn * u1 + (d2 * w - d1 * w1) / speed**2,
-                (w * w1 + d1 * d2) / speed,
+                frame.turn * u1 + (d2 * w - d1 * w1) / divisor**2,
+                (w * w1 + d1 * d2) / divisor,
             ],
             axis=1,
         )
@@ -98,7 +105,8 @@ class TrackVehicle:
         inside = np.clip(times, knots[0, 0], knots[-1, 0])
         distance = speed.antiderivative()(inside) + speed(inside) * (times - inside)
         u = self.arc_m + distance[:-1] - distance[-1]
-        return u, speed(inside[:-1]), speed(inside[:-1], 1)
+        # Rounding must not turn a vehicle at rest around.
+        return u, np.maximum(speed(inside[:-1]), 0.0), speed(inside[:-1], 1)
 
     def _across(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the lateral offset and its first two derivatives by time."""
@@ -120,11 +128,17 @@ class DrawnVehicle:
     """A vehicle whose motion is drawn from the CTRV model, so that a filter with this model is consistent."""
 
     x_m: float
+    """Position at the start, in the map frame."""
     y_m: float
+    """Position at the start, in the map frame."""
     yaw_rad: float
+    """Direction of travel at the start, 0 along +x, counter-clockwise."""
     speed_mps: float
+    """Speed at the start."""
     yaw_rate_radps: float = 0.0
+    """Yaw rate at the start."""
     motion: CTRV = field(default_factory=CTRV)
+    """Process noise of the CTRV model."""
     step_s: PositiveFloat = 0.01
     """Time between two draws of the process noise. Between the draws, the noise is a Brownian bridge.
 
@@ -181,10 +195,6 @@ class DrawnTrajectory:
         states[:, : motion.dim] = motion.predict(self.step_states[k], within_s) + noise
         states[:, YAW] = wrap_angles(states[:, YAW])
         return states
-
-
-#: Any vehicle, selected by its kind.
-AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
 
 
 def draw_states(

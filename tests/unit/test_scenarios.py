@@ -1,17 +1,15 @@
 """The committed scenarios and the built-in one, which is a picture of the data of Karle et al. 2023, section III-H."""
 
-from dataclasses import fields
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from fgtrack.config.keys import commented, sections
 from fgtrack.config.reading import read_scenario
+from fgtrack.config.shipped import shipped
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
-from fgtrack.sim.scenario import EgoMessages, Scenario
-from fgtrack.sim.sensor import SimulatedSensor
+from fgtrack.core.yaml_text import safe_yaml
+from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
 
 EGO_ID = -1
 
@@ -79,9 +77,20 @@ def test_cars_of_the_default_follow_each_other_and_overtake_at_the_speeds_of_the
     assert relative.max() > 5.0
 
 
-def test_the_page_on_scenarios_names_every_key() -> None:
-    page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
-    kinds = (Scenario, SimulatedSensor, EgoMessages, TrackVehicle)
-    names = [item.name for kind in kinds for item in fields(kind)]
-    missing = [name for name in names if f"`{name}`" not in page and name != "kind"]
-    assert not missing
+def test_the_printed_scenario_is_a_scenario_file() -> None:
+    for name in shipped("scenario"):
+        scenario = read_scenario(name)
+        assert read_scenario(safe_yaml(commented(scenario))) == scenario
+
+
+def test_the_printed_scenario_holds_every_kind_and_every_key() -> None:
+    text = commented(read_scenario("single_opponent"))
+    for section in sections(Scenario):
+        named = (f"kind: {section.kind}.", f'kind: "{section.kind}"')
+        assert section.kind is None or any(name in text for name in named)
+        for one in section.settings:
+            assert (
+                f" {one.name}: " in f" {text}".replace("\n", " ")
+                or f" {one.name}:\n" in text
+            )
+    assert "rate_hz: 20.0  # Rate of the scans; default 20" in text
