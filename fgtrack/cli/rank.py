@@ -10,11 +10,10 @@ from fgtrack.cli.arguments import FormOption, Overwrite, Seed
 from fgtrack.cli.show import progress, say, sentences, show
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.output import check_output, new_files
-from fgtrack.evaluation.tables import Tables
 from fgtrack.ranking.files import write_exact, write_problem
-from fgtrack.ranking.judge import Ranking
-from fgtrack.ranking.judge import rank as ranked
-from fgtrack.ranking.methods import method
+from fgtrack.ranking.judge import judge
+from fgtrack.ranking.public import method
+from fgtrack.ranking.result import Ranking
 from fgtrack.ranking.scenarios import SCENARIOS, draw
 
 
@@ -23,7 +22,7 @@ def rank(
         list[str] | None,
         Argument(
             metavar="METHOD...",
-            help="Estimator of fgtrack, Python file (.py), or executable program.",
+            help="Estimator of fgtrack, Python file (FILE.py or FILE.py:NAME), or executable program.",
         ),
     ] = None,
     scenarios: Annotated[
@@ -60,26 +59,24 @@ def rank(
     if not chosen:
         return
     with progress("rank") as step:
-        found = ranked(chosen, names, num_runs=runs, seed=seed, on_step=step)
-    tables = Tables({table.title: table for table in found.tables()})
-    show(tables, form)
+        found = judge(chosen, names, runs, seed, step)
+    show(found.tables, form)
     if form is None:
         for each in chosen:
             say(f"{each.name}:")
             sentences(found.sentences(each.name))
     if out is not None:
-        _write(out, found, tables, [each.name for each in chosen], overwrite)
-    failed = [each for each in found.results if each.problem is not None]
+        _write(out, found, [each.name for each in chosen], overwrite)
+    failed = [each for each in found.results if each.problem and each.takes_part]
     if failed:
         raise DataError(
             f"{failed[0].method}: {failed[0].scenario}: {failed[0].problem}"
         )
 
 
-def _write(
-    out: Path, found: Ranking, tables: Tables, names: list[str], overwrite: bool
-) -> None:
+def _write(out: Path, found: Ranking, names: list[str], overwrite: bool) -> None:
     """Write the tables, and a page for each method, into the folder `out`."""
+    tables = found.tables
     with new_files(out, overwrite) as folder:
         (folder / "ranking.md").write_text(tables.to_markdown(), encoding="utf-8")
         (folder / "ranking.tex").write_text(tables.to_latex(), encoding="utf-8")

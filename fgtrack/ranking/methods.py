@@ -1,28 +1,21 @@
-"""Methods that are ranked: estimators of fgtrack, Python files, and programs in any language."""
+"""Methods that are ranked: the interface, estimators of fgtrack, and programs in any language."""
 
 import csv
-import importlib.util
-import math
-import os
 import subprocess
 import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, FgtrackError, one_line
-from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.registry import ESTIMATORS, estimator
+from fgtrack.estimation.registry import estimator
 from fgtrack.ranking.files import read_states, write_problem
-from fgtrack.ranking.problem import Answer, Problem, answer_of
+from fgtrack.ranking.problem import Answer, Problem, answer_of, cut_after
 
 WINDOW_S = 10.0
 """Window of the shipped estimators; it is longer than a scenario."""
@@ -44,32 +37,37 @@ class Answers:
     seconds: float
     """Processor time, for a program the time on the clock."""
     refused: Mapping[str, int] = field(default_factory=dict)
-    """Number of measurements that were not fused, by reason; only shipped estimators report it."""
+    """Number of measurements that were not fused, by reason; programs do not report it."""
 
 
 class Method(ABC):
     """A method with a name."""
 
     name: str
+    is_traced = True
+    """True if the memory of the method is that of this process."""
 
     @abstractmethod
     def answers(self, problem: Problem) -> Answers:
-        """Answer all queries. Raises `MethodError` if the method fails."""
+        """Answer all queries.
 
-    def is_causal(self, problem: Problem) -> bool:
-        """True if the answers to the first queries do not change where all later arrivals are missing."""
-        first = problem.queries[0].num_known
-        queries = [query for query in problem.queries if query.num_known == first]
-        cut = Problem(
-            problem.scenario,
-            problem.motion,
-            problem.start,
-            problem.arrivals[:first],
-            tuple(queries),
-            problem.truth,
-        )
-        alone = self.answers(cut).answers
-        return all(map(_are_same, alone, self.answers(problem).answers))
+        Raises `MethodError` if the method fails, and `NotImplementedError` if it is not
+        made for the scenario.
+        """
+
+    def is_causal(self, problem: Problem, found: Answers) -> bool:
+        """True if answers do not change where all later arrivals are missing.
+
+        The first query and a query in the middle are tested. `found` holds the answers
+        to the whole problem.
+        """
+        times = sorted({query.num_known for query in problem.queries})
+        for num_known in sorted({times[0], times[len(times) // 2]} - {times[-1]}):
+            cut = cut_after(problem, num_known)
+            alone = self.answers(cut).answers
+            if not all(map(_are_same, alone, found.answers)):
+                return False
+        return True
 
 
 def _are_same(a: Answer | None, b: Answer | None) -> bool:
@@ -84,7 +82,7 @@ class Shipped(Method):
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def is_causal(self, problem: Problem) -> bool:
+    def is_causal(self, problem: Problem, found: Answers) -> bool:
         """True: the estimator gets the measurements one by one."""
         return True
 
@@ -110,106 +108,10 @@ class Shipped(Method):
         return Answers(tuple(found), time.process_time() - started_s, refused)
 
 
-@dataclass(frozen=True)
-class Observation:
-    """A measurement for a method in a Python file; times are in s after the start of the problem."""
-
-    stamp_s: float
-    receipt_s: float
-    sensor: str
-    values: Mapping[str, float]
-    """Measured components by name: `x_m`, `y_m`, `range_m`, `bearing_rad`, `range_rate_mps`."""
-    stds: Mapping[str, float]
-    """Standard deviations by the same names."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """Description of a problem for a method in a Python file."""
-
-    motion: str
-    """Motion model: `cv` or `ctrv`."""
-    parameters: Mapping[str, float]
-    """Noise densities of the motion model."""
-    mean: FloatArray
-    """Mean of x, y, vx, vy at time 0, shape (4,)."""
-    covariance: FloatArray
-    """Covariance of the mean, shape (4, 4)."""
-
-
-class PythonFile(Method):
-    """A class with `update` and `state_at`, or a function `fuse`, in a Python file."""
-
-    def __init__(self, path: Path) -> None:
-        self.name = path.stem
-        module = _module(path)
-        self._fuse: Callable[..., Any] | None = getattr(module, "fuse", None)
-        self._make = next(
-            (
-                each
-                for each in vars(module).values()
-                if isinstance(each, type)
-                and each.__module__ == module.__name__
-                and hasattr(each, "update")
-                and hasattr(each, "state_at")
-            ),
-            None,
-        )
-        if self._fuse is None and self._make is None:
-            raise CallError(
-                f"{path}: define a class with update(observation) and state_at(time_s), "
-                "or a function fuse(given, observations, queries)"
-            )
-
-    def is_causal(self, problem: Problem) -> bool:
-        """True for a class, which gets the measurements one by one; a function is tested."""
-        return self._fuse is None or super().is_causal(problem)
-
-    def answers(self, problem: Problem) -> Answers:
-        """Answer all queries. Raises `MethodError` if the code raises."""
-        started_s = time.process_time()
-        try:
-            raw = (
-                self._from_function(problem)
-                if self._fuse
-                else self._one_by_one(problem)
-            )
-        except Exception as error:
-            raise MethodError(
-                f"{self.name}: {problem.scenario}: {type(error).__name__}: {one_line(str(error))}"
-            ) from error
-        if len(raw) != len(problem.queries):
-            raise MethodError(
-                f"{self.name}: {problem.scenario}: {len(problem.queries)} answers are expected, {len(raw)} came"
-            )
-        return Answers(
-            tuple(_checked(self.name, each) for each in raw),
-            time.process_time() - started_s,
-        )
-
-    def _one_by_one(self, problem: Problem) -> list[Any]:
-        assert self._make is not None
-        one = self._make(_given(problem))
-        found = []
-        known = 0
-        for query in problem.queries:
-            for observation in _observations(problem)[known : query.num_known]:
-                one.update(observation)
-            known = query.num_known
-            found.append(one.state_at(_after_start_s(problem, query.stamp_ns)))
-        return found
-
-    def _from_function(self, problem: Problem) -> list[Any]:
-        assert self._fuse is not None
-        queries = [
-            (query.num_known, _after_start_s(problem, query.stamp_ns))
-            for query in problem.queries
-        ]
-        return list(self._fuse(_given(problem), _observations(problem), queries))
-
-
 class Program(Method):
     """A program that is called as `PROGRAM measurements.csv states.csv`."""
+
+    is_traced = False
 
     def __init__(self, path: Path) -> None:
         self.name = path.name
@@ -244,88 +146,3 @@ class Program(Method):
                     f"{self.name}: {problem.scenario}: states.csv: {one_line(str(error))}"
                 ) from error
             return Answers(tuple(found), seconds)
-
-
-def method(text: str) -> Method:
-    """Return the method that `text` names: an estimator, a Python file, or a program.
-
-    Raises `CallError` for anything else.
-    """
-    path = Path(text)
-    if path.suffix == ".py" and path.is_file():
-        return PythonFile(path)
-    if path.is_file() and os.access(path, os.X_OK):
-        return Program(path)
-    if path.is_file():
-        raise CallError(f"{text}: is neither a Python file nor an executable program")
-    return Shipped(ESTIMATORS.resolve(text))
-
-
-def _given(problem: Problem) -> Given:
-    prior = problem.prior
-    assert prior.covariance is not None
-    parameters = {
-        name: float(getattr(problem.motion, name))
-        for name in type(problem.motion).density_names()
-    }
-    return Given(
-        type(problem.motion).__name__.lower(), parameters, prior.mean, prior.covariance
-    )
-
-
-def _observations(problem: Problem) -> Sequence[Observation]:
-    found = []
-    for each in problem.arrivals:
-        z = each.measurement.z
-        names = each.measurement.model.components
-        stds = np.sqrt(np.diag(each.measurement.R)).tolist()
-        found.append(
-            Observation(
-                _after_start_s(problem, each.measurement.stamp_ns),
-                _after_start_s(problem, each.receipt_ns),
-                each.sensor,
-                dict(zip(names, z.tolist(), strict=True)),
-                dict(zip(names, stds, strict=True)),
-            )
-        )
-    return found
-
-
-def _after_start_s(problem: Problem, stamp_ns: int) -> float:
-    return (stamp_ns - problem.start.stamp_ns) / NS_PER_S
-
-
-def _checked(name: str, raw: Any) -> Answer | None:
-    """Return an answer: None, a mean, or a mean and a covariance. Raises `MethodError` for anything else."""
-    if raw is None:
-        return None
-    mean, covariance = raw if isinstance(raw, tuple) else (raw, None)
-    mean = np.asarray(mean, dtype=np.float64)
-    if mean.shape != (4,):
-        raise MethodError(
-            f"{name}: a mean must be x, y, vx, vy, shape (4,); its shape is {mean.shape}"
-        )
-    if covariance is None:
-        return Answer(mean, None)
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if covariance.shape != (4, 4):
-        raise MethodError(
-            f"{name}: a covariance must have shape (4, 4); its shape is {covariance.shape}"
-        )
-    if not math.isfinite(float(mean.sum() + covariance.sum())):
-        raise MethodError(f"{name}: an answer is not finite")
-    return Answer(mean, covariance)
-
-
-def _module(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"fgtrack_ranked_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise CallError(
-            f"{path}: cannot be imported: {type(error).__name__}: {one_line(str(error))}"
-        ) from error
-    return module

@@ -1,7 +1,7 @@
 """One object, its measurements in the order of arrival, the questions to a method, and the exact answers."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,11 +27,18 @@ class Arrival:
     receipt_ns: int
     sensor: str
     measurement: Measurement
+    """The stamp comes from the clock of the sensor."""
+    true_stamp_ns: int
 
     @property
     def key(self) -> tuple[str, int, bytes]:
         """Value that is equal for two copies of one measurement."""
         return self.sensor, self.measurement.stamp_ns, self.measurement.z.tobytes()
+
+    @property
+    def at_true_stamp(self) -> Measurement:
+        """Measurement with its true stamp."""
+        return replace(self.measurement, stamp_ns=self.true_stamp_ns)
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class Query:
     """Number of arrivals that are known."""
     stamp_ns: int
     lag_s: float
-    """Time from the stamp to the newest known stamp."""
+    """Time from the stamp to the newest true stamp that is known."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +84,12 @@ class Problem:
     def exact(self) -> tuple[Answer, ...]:
         """Exact joint estimate of each query, from the measurements that are known then, copies once.
 
-        For nonlinear models it is the maximum of the posterior density, with the covariance
-        of its Gaussian approximation.
+        The measurements have their true stamps. For nonlinear models it is the maximum of
+        the posterior density, with the covariance of its Gaussian approximation.
         """
         answers: dict[Query, Answer] = {}
         for num_known in sorted({query.num_known for query in self.queries}):
-            known = {each.key: each.measurement for each in self.arrivals[:num_known]}
+            known = {each.key: each.at_true_stamp for each in self.arrivals[:num_known]}
             asked = [query for query in self.queries if query.num_known == num_known]
             states = dense_joint(
                 self.motion,
@@ -106,21 +113,33 @@ def answer_of(motion: MotionModel, state: TrackState) -> Answer:
     return Answer(mean, gradient @ state.covariance[:4, :4] @ gradient.T)
 
 
+def cut_after(problem: Problem, num_known: int) -> Problem:
+    """Return the problem with its first `num_known` arrivals, and the queries that they answer."""
+    return replace(
+        problem,
+        arrivals=problem.arrivals[:num_known],
+        queries=tuple(each for each in problem.queries if each.num_known <= num_known),
+    )
+
+
 def queries_of(
     stamps_ns: Sequence[int], start_ns: int, num_times: int
 ) -> tuple[Query, ...]:
-    """Return queries after `num_times` arrivals, evenly spread; each time asks for the present and for the past.
+    """Return queries after `num_times` arrivals, evenly spread, and after the latest one.
 
-    `stamps_ns` are the stamps of the arrivals in their order. The first queries come
-    after the first third of the arrivals. A stamp before `start_ns` is not asked for.
+    Each time asks for the present and for the past. `stamps_ns` are the true stamps of
+    the arrivals in their order. The evenly spread queries begin after the first third
+    of the arrivals. The latest arrival has the longest time from its stamp to the newest
+    stamp. A stamp before `start_ns` is not asked for.
     """
     last = len(stamps_ns)
-    times = np.unique(np.linspace(last // 3, last, num_times).round().astype(np.int64))
+    newest_ns = np.maximum.accumulate(np.array(stamps_ns))
+    latest = int(np.argmax(newest_ns - np.array(stamps_ns))) + 1
+    spread = np.linspace(last // 3, last, num_times).round().astype(np.int64)
     queries = []
-    for num_known in times.tolist():
-        newest_ns = max(stamps_ns[:num_known])
+    for num_known in np.union1d(spread, [latest]).tolist():
         for lag_s in LAGS_S:
-            stamp_ns = newest_ns - round(lag_s * NS_PER_S)
+            stamp_ns = int(newest_ns[num_known - 1]) - round(lag_s * NS_PER_S)
             if stamp_ns >= start_ns:
                 queries.append(Query(num_known, stamp_ns, lag_s))
     return tuple(queries)

@@ -19,6 +19,7 @@ START_NS = 1_790_000_000 * NS_PER_S
 DURATION_S = 4.0
 NUM_TIMES = 5
 """Number of times in a run at which a method is asked."""
+_US_PER_S = 1_000_000
 _LINEAR = CV(velocity_density_m2ps3=2.0)
 _START = Start(
     stamp_ns=START_NS,
@@ -45,6 +46,10 @@ class Sensor:
     delays: Delays
     copies: float = 0.0
     """Probability that a measurement is delivered a second time."""
+    first_s: float | None = None
+    """Stamp of the first measurement after the start; None if it is drawn within a period."""
+    clock_offset_s: float = 0.0
+    """Time of the sensor's clock minus true time; it shifts the stamps."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Scenario:
     def draw(self, name: str, rng: np.random.Generator) -> Problem:
         """Draw delays, the motion and the measurements; the problem is called `name`."""
         sent = [
-            (START_NS + nanoseconds(stamp_s), sensor, float(delay_s))
+            (START_NS + _whole_us(stamp_s), sensor, float(delay_s))
             for sensor, of in self.sensors.items()
             for stamp_s, delay_s in _sendings(of, rng)
         ]
@@ -78,7 +83,7 @@ class Scenario:
             for stamp_ns, sensor, _ in sorted(sent)
         }
         arrivals = tuple(
-            Arrival(receipt_ns, sensor, measured[stamp_ns, sensor])
+            Arrival(receipt_ns, sensor, measured[stamp_ns, sensor], stamp_ns)
             for receipt_ns, stamp_ns, sensor in received
         )
         truth = {
@@ -109,7 +114,13 @@ class Scenario:
         model = measurement_model(tuple(std), self.motion)
         noise = np.array(list(std.values()))
         z = model.predict(x, AT_ORIGIN) + noise * rng.standard_normal(len(noise))
-        return Measurement(stamp_ns, model, z, np.diag(noise**2))
+        offset_ns = nanoseconds(self.sensors[sensor].clock_offset_s)
+        return Measurement(stamp_ns + offset_ns, model, z, np.diag(noise**2))
+
+
+def _whole_us(duration_s: float) -> int:
+    """Return a duration in ns, rounded to microseconds: clocks of other languages are not finer."""
+    return round(duration_s * _US_PER_S) * 1000
 
 
 def _certain(stamp_ns: int, x: FloatArray) -> TrackState:
@@ -120,7 +131,8 @@ def _sendings(
     sensor: Sensor, rng: np.random.Generator
 ) -> Iterator[tuple[float, float]]:
     """Yield stamp and delay of each measurement of a sensor in s, the stamps after the start."""
-    first_s = rng.uniform(0.1, 1.0) * sensor.period_s
+    drawn_s = rng.uniform(0.1, 1.0) * sensor.period_s
+    first_s = drawn_s if sensor.first_s is None else sensor.first_s
     stamps_s = np.arange(first_s, DURATION_S, sensor.period_s)
     delays_s = sensor.delays(stamps_s, rng)
     yield from zip(stamps_s.tolist(), delays_s.tolist(), strict=True)
@@ -135,9 +147,9 @@ def _deliveries(
         yield delay_s + rng.uniform(0.01, 0.5)
 
 
-def _gamma(mean_s: float) -> Delays:
-    """Independent delays with a gamma distribution of shape 2."""
-    return lambda stamps_s, rng: rng.gamma(2.0, mean_s / 2.0, len(stamps_s))
+def _gamma(mean_s: float, least_s: float = 0.0) -> Delays:
+    """Independent delays: `least_s` and a gamma distribution of shape 2 with the mean `mean_s`."""
+    return lambda stamps_s, rng: least_s + rng.gamma(2.0, mean_s / 2.0, len(stamps_s))
 
 
 def _in_time(stamps_s: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -152,11 +164,8 @@ def _outages(stamps_s: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(np.where(down, held_s, 0.01))
 
 
-def _one_late(stamps_s: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return delays of 0, except one measurement that is 1 s late."""
-    delays_s = np.zeros(len(stamps_s))
-    delays_s[len(delays_s) // 2] = 1.0
-    return delays_s
+def _fixed(delay_s: float) -> Delays:
+    return lambda stamps_s, rng: np.full(len(stamps_s), delay_s)
 
 
 _XY = {"x_m": 0.3, "y_m": 0.3}
@@ -168,15 +177,21 @@ _LATE = {
     "radar": Sensor(0.1, _COARSE, _gamma(0.06)),
 }
 
+
+def _one_late(steps: int) -> Scenario:
+    """Return a scenario whose single accurate position arrives after `steps` later positions."""
+    return Scenario(
+        f"an accurate position between two others arrives {steps} step{'s' if steps > 1 else ''} late",
+        {
+            "lidar": Sensor(DURATION_S, _XY, _fixed(steps * 0.1), first_s=2.05),
+            "radar": Sensor(0.1, _COARSE, _in_time, first_s=0.1),
+        },
+    )
+
+
 SCENARIOS: Mapping[str, Scenario] = {
     "linear": Scenario("positions of two late sensors, constant velocity", _LATE),
-    "one-late": Scenario(
-        "one accurate position is 1 s late, the others are in time",
-        {
-            "lidar": Sensor(3.0, _XY, _one_late),
-            "radar": Sensor(0.1, _COARSE, _in_time),
-        },
-    ),
+    **{f"late-by-{steps}": _one_late(steps) for steps in (1, 3, 10)},
     "bursts": Scenario(
         "a link that is down for 0.8 s in every 2 s",
         {
@@ -189,6 +204,13 @@ SCENARIOS: Mapping[str, Scenario] = {
         {
             "lidar": Sensor(0.1, _XY, _gamma(0.15), copies=0.2),
             "radar": Sensor(0.1, _COARSE, _gamma(0.06), copies=0.2),
+        },
+    ),
+    "two-clocks": Scenario(
+        "the clock of one sensor is 0.1 s ahead; the offset is unknown",
+        {
+            "lidar": Sensor(0.1, _XY, _gamma(0.15)),
+            "radar": Sensor(0.1, _COARSE, _gamma(0.06, 0.1), clock_offset_s=0.1),
         },
     ),
     "range-bearing": Scenario(

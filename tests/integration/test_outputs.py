@@ -169,12 +169,12 @@ WRITERS = [
     (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
     (("ledger", "noisy.jsonl", "--figure", "ledger.png"), "ledger.png"),
     (
-        ("rank", "drop", "--scenario", "one-late", "--runs", "2", "-o", "ranking"),
+        ("rank", "drop", "--scenario", "late-by-3", "--runs", "2", "-o", "ranking"),
         "ranking",
     ),
     (
-        ("rank", "--export", "problems", "--scenario", "one-late"),
-        "problems/one-late",
+        ("rank", "--export", "problems", "--scenario", "late-by-3"),
+        "problems/late-by-3",
     ),
 ]
 #: A sweep goes on where it was, and makes its tables anew.

@@ -1,0 +1,224 @@
+"""Results of methods: measures, sentences, ranks and tables."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.intervals import Estimate, average, paired
+from fgtrack.evaluation.tables import Column, Table, Tables
+from fgtrack.ranking.problem import LAGS_S
+from fgtrack.ranking.scenarios import SCENARIOS
+
+EXACT = 1e-6
+"""Largest deviation, in standard deviations, of a method that counts as exact."""
+_NUM_STATES = 4
+_US = 1e6
+_KB = 1e-3
+
+
+@dataclass(frozen=True)
+class Result:
+    """Answers of a method in one scenario, compared with truth and exact estimate."""
+
+    method: str
+    scenario: str
+    rmse_m: FloatArray
+    """Root mean square position error by run and lag, shape (runs, lags); NaN without an answer."""
+    deviations: FloatArray
+    """Largest deviation from the exact mean in standard deviations by run and lag, shape (runs, lags)."""
+    nees: FloatArray
+    """Mean NEES of the present x, y, vx, vy by run, shape (runs,); NaN without covariances."""
+    order: float
+    """Largest change of the last answers, in standard deviations, if the arrivals come in another order."""
+    refused: Mapping[str, int]
+    """Number of measurements that were not fused, by reason."""
+    seconds: float
+    """Time for one measurement."""
+    peak_bytes: float = math.nan
+    """Largest memory of Python and NumPy during a run; NaN for a program."""
+    problem: str | None = None
+    """Reason why the method has no answers; None if it has."""
+    takes_part: bool = True
+    """False if the method is not made for the scenario."""
+
+    @classmethod
+    def without_answers(
+        cls, method: str, scenario: str, problem: str, takes_part: bool = True
+    ) -> "Result":
+        """Return the result of a method that has no answers."""
+        empty = np.full((0, len(LAGS_S)), math.nan)
+        return cls(
+            method,
+            scenario,
+            empty,
+            empty,
+            np.zeros(0),
+            math.nan,
+            {},
+            math.nan,
+            problem=problem,
+            takes_part=takes_part,
+        )
+
+    @property
+    def deviation(self) -> float:
+        """Largest deviation of the present estimate over the runs."""
+        return float(self.deviations[:, 0].max()) if len(self.deviations) else math.nan
+
+    @property
+    def sentence(self) -> str:
+        """Departure from the exact estimate in words."""
+        if not self.takes_part:
+            return f"{self.scenario}: takes no part: {self.problem}"
+        if self.problem is not None:
+            return f"{self.scenario}: no result: {self.problem}"
+        parts = [
+            _departure(lag_s, value)
+            for lag_s, value in zip(
+                LAGS_S, self.deviations.max(axis=0).tolist(), strict=True
+            )
+        ]
+        if self.order < EXACT:
+            parts.append("the order of arrival does not matter")
+        elif math.isfinite(self.order):
+            parts.append(
+                f"another order of arrival changes it by {self.order:.2g} standard deviations"
+            )
+        anees = average(self.nees)
+        if anees.is_known and anees.low > _NUM_STATES:
+            parts.append(
+                f"its covariance is too small: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
+            )
+        elif anees.is_known and anees.high < _NUM_STATES:
+            parts.append(
+                f"its covariance is too large: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
+            )
+        if self.refused:
+            parts.append(
+                f"{sum(self.refused.values())} measurements not fused "
+                f"({', '.join(f'{reason} {number}' for reason, number in sorted(self.refused.items()))})"
+            )
+        return f"{self.scenario}: {'; '.join(parts)}"
+
+
+def _departure(lag_s: float, deviation: float) -> str:
+    """Return the departure from the exact estimate at a lag in words."""
+    when = f"{lag_s:g} s ago" if lag_s else "now"
+    if math.isnan(deviation):
+        return f"{when} no answer"
+    if deviation < EXACT:
+        return f"{when} exact"
+    return f"{when} up to {deviation:.2g} standard deviations off"
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Results of all methods in all scenarios."""
+
+    results: tuple[Result, ...]
+    num_runs: int
+
+    @property
+    def tables(self) -> Tables:
+        """A table for each scenario, the best method first."""
+        scenarios = dict.fromkeys(result.scenario for result in self.results)
+        return Tables({name: self._table(name) for name in scenarios})
+
+    def __str__(self) -> str:
+        return str(self.tables)
+
+    def sentences(self, method: str) -> list[str]:
+        """Return a sentence for each scenario on where, and by how much, `method` departs from the exact estimate."""
+        return [each.sentence for each in self.results if each.method == method]
+
+    def _table(self, scenario: str) -> Table:
+        results = [each for each in self.results if each.scenario == scenario]
+        records = [{**_record(each), "rank": rank} for each, rank in _ranked(results)]
+        notes = [
+            f"{SCENARIOS[scenario].about}; {self.num_runs} runs; brackets: 95 % intervals over the runs",
+            "rank: methods whose error now does not differ significantly from the best one of the rank share it",
+            "deviation: largest deviation of x, y, vx, vy from the exact joint estimate, in its standard deviations",
+            f"ANEES: {_NUM_STATES} for a covariance that is right; order: largest change by another order of arrival",
+            "time: processor time for a measurement; memory: peak of Python and NumPy during a run",
+        ]
+        return Table(scenario, records, _COLUMNS, ("method",), notes)
+
+
+_COLUMNS = (
+    Column("method", left=True),
+    Column("rank"),
+    Column("error now\n[m]", "error_m error_low_m error_high_m", "{} ({} to {})"),
+    *(
+        Column(f"error {lag_s:g} s\nago [m]", f"error_{k}_m")
+        for k, lag_s in enumerate(LAGS_S)
+        if k
+    ),
+    Column("deviation\nnow", "deviation_0", text=lambda value: _scientific(value)),
+    *(
+        Column(
+            f"{lag_s:g} s\nago", f"deviation_{k}", text=lambda value: _scientific(value)
+        )
+        for k, lag_s in enumerate(LAGS_S)
+        if k
+    ),
+    Column("ANEES", "anees"),
+    Column("ANEES, 95 %", "anees_low anees_high", "{} to {}", is_extra=True),
+    Column("order", text=lambda value: _scientific(value)),
+    Column("not\nfused", "refused"),
+    Column("time\n[us]", "seconds", scale=_US),
+    Column("memory\n[kB]", "peak_bytes", scale=_KB),
+)
+
+
+def _ranked(results: Sequence[Result]) -> list[tuple[Result, int | None]]:
+    """Return the results with their ranks, the best first; a method without answers has no rank."""
+    known = [each for each in results if len(each.rmse_m)]
+    known.sort(key=lambda each: (_mean(each.rmse_m[:, 0].tolist()), each.method))
+    ranked: list[tuple[Result, int | None]] = []
+    first: Result | None = None
+    rank = 0
+    for number, each in enumerate(known, start=1):
+        if first is None or paired(each.rmse_m[:, 0], first.rmse_m[:, 0]).low > 0.0:
+            first, rank = each, number
+        ranked.append((each, rank))
+    return [*ranked, *((each, None) for each in results if not len(each.rmse_m))]
+
+
+def _record(result: Result) -> dict[str, object]:
+    if result.problem is not None:
+        return {"method": result.method, "problem": result.problem}
+    now, anees = average(result.rmse_m[:, 0]), average(result.nees)
+    record: dict[str, object] = {
+        "method": result.method,
+        **_interval("error", now, "_m"),
+        **_interval("anees", anees, ""),
+        "order": result.order,
+        "refused": sum(result.refused.values()),
+        "seconds": result.seconds,
+        "peak_bytes": result.peak_bytes,
+    }
+    for k, _ in enumerate(LAGS_S):
+        record[f"error_{k}_m"] = _mean(result.rmse_m[:, k].tolist())
+        record[f"deviation_{k}"] = float(result.deviations[:, k].max())
+    return record
+
+
+def _interval(name: str, estimate: Estimate, unit: str) -> dict[str, float]:
+    return {
+        f"{name}{unit}": estimate.mean,
+        f"{name}_low{unit}": estimate.low,
+        f"{name}_high{unit}": estimate.high,
+    }
+
+
+def _scientific(value: str | int | float) -> str:
+    if not isinstance(value, float) or not math.isfinite(value):
+        return "-"
+    return "0" if not value else f"{value:.1e}" if value < 0.01 else f"{value:.2g}"
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else math.nan

@@ -1,0 +1,73 @@
+"""The adapters of other packages for `fgtrack rank`: what is known of each package is found and named."""
+
+from pathlib import Path
+
+import pytest
+
+from fgtrack.ranking.public import rank
+from fgtrack.ranking.result import EXACT, Result
+
+METHODS = Path(__file__).parents[2] / "experiments/leaderboard/methods"
+STONE_SOUP = METHODS / "stone_soup.py"
+LATE = ("late-by-1", "late-by-3", "late-by-10")
+
+
+def results(package: str, name: str, scenarios: tuple[str, ...]) -> list[Result]:
+    pytest.importorskip(package, reason=f"{package} is not installed (extra `rivals`)")
+    file = {"stonesoup": "stone_soup", "pyrecest": "pyrecest_replay"}.get(
+        package, "filterpy_lag"
+    )
+    found = rank([f"{METHODS / file}.py:{name}"], scenarios, num_runs=2).results
+    assert [each.problem for each in found] == [None] * len(scenarios)
+    return list(found)
+
+
+def test_stone_soup_is_exact_for_a_user_who_sorts() -> None:
+    (result,) = results("stonesoup", "Sorted", ("late-by-10",))
+    assert result.deviation < 1e-12
+    assert result.order < EXACT
+    assert "now exact; 0.3 s ago up to" in result.sentence
+
+
+def test_accumulated_densities_of_stone_soup_depart_with_the_lag() -> None:
+    found = results("stonesoup", "Accumulated", LATE)
+    deviations = [each.deviation for each in found]
+    for deviation, measured in zip(deviations, (3e-5, 0.03, 0.10), strict=True):
+        assert measured / 5 < deviation < measured * 5
+    assert sorted(deviations) == deviations
+    assert all(each.order > 0.1 for each in found)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of Stone Soup
+def test_accumulated_densities_of_stone_soup_diverge_where_much_is_late() -> None:
+    pytest.importorskip("stonesoup", reason="stonesoup is not installed")
+    (result,) = rank([f"{STONE_SOUP}:Accumulated"], ["linear"], num_runs=2).results
+    assert result.problem == "Accumulated: an answer is not finite"
+
+
+def test_examples_of_stone_soup_for_late_data_are_named() -> None:
+    for name, least in (("AtArrival", 2.0), ("Buffered", 1.0)):
+        (result,) = results("stonesoup", name, ("late-by-10",))
+        assert result.deviation > least
+        assert "another order of arrival changes it by" in result.sentence
+
+
+def test_stone_soup_sorts_range_and_bearing() -> None:
+    (result,) = results("stonesoup", "Sorted", ("range-bearing",))
+    assert result.deviation < 1.0
+
+
+@pytest.mark.slow  # PyRecEst takes seconds to import
+def test_the_replay_of_pyrecest_departs_for_a_position_between_its_steps() -> None:
+    found = results("pyrecest", "Replay", LATE)
+    deviations = [each.deviation for each in found]
+    assert deviations[0] > deviations[1] > deviations[2] > 0.1
+    assert deviations[0] > 0.8
+    assert "now up to" in found[0].sentence
+    assert "0.3 s ago no answer" in found[0].sentence
+
+
+def test_the_smoother_of_filterpy_has_no_door_for_late_data() -> None:
+    (result,) = results("filterpy", "FixedLag", ("late-by-3",))
+    assert "2 measurements not fused (refused 2)" in result.sentence
+    assert result.deviation > 0.1
