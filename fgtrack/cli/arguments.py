@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from typer import Argument, Option
 
 from fgtrack.inputs.recording import Storage
+from fgtrack.runs import TableFormat
 
 Input = Annotated[
     Path,
@@ -48,6 +49,13 @@ Runs = Annotated[
 Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[
     Storage, Option("--storage", help="Storage of a rosbag2 folder.")
+]
+TableFormatOption = Annotated[
+    TableFormat,
+    Option(
+        "--format",
+        help="Tables of the run folder: csv, or parquet (pyarrow) for hours.",
+    ),
 ]
 Form = Literal["md", "csv", "latex", "json"]
 FormOption = Annotated[

@@ -12,6 +12,7 @@ from fgtrack.cli.arguments import (
     Overwrite,
     PitMap,
     Settings,
+    TableFormatOption,
     TrackMap,
 )
 from fgtrack.cli.show import progress, say, warn
@@ -51,6 +52,7 @@ def replay(
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
+    table_format: TableFormatOption = "csv",
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker.
@@ -78,6 +80,7 @@ def replay(
                 f"tick {report.tick}, {len(report.tracks)} tracks"
             ),
             overwrite=overwrite,
+            table_format=table_format,
         )
     for line in dict.fromkeys(
         str(replace(draft.config, estimator=name).effective) for name in names

@@ -17,7 +17,7 @@ from fgtrack.inputs.validation import InvalidMessageError, validated_message
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.simulation import simulated
-from fgtrack.runs import Run, load_run
+from fgtrack.runs import Run, TableFormat, load_run
 from fgtrack.sim.scenario import Scenario
 
 
@@ -31,6 +31,7 @@ def replay(
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     out: str | Path | None = None,
     overwrite: bool = False,
+    table_format: TableFormat = "csv",
 ) -> Run:
     """Replay a recording and return the run, which equals the run of the command `fgtrack replay`.
 
@@ -55,6 +56,8 @@ def replay(
         Folder for the run; None keeps the run in memory.
     overwrite
         True to replace an existing run in `out`.
+    table_format
+        Format of the tables in `out`: `csv` or `parquet`.
     """
     resolved = read_config(
         config, set, track_map=map, pit_map=pit_map, estimator=estimator
@@ -78,7 +81,13 @@ def replay(
         repeatable = pipeline.repeatable(messages, resolved)
         folders = {resolved.estimator: Path(out)}
         pipeline.replay(
-            repeatable, resolved, folders, origin=origin, kind=kind, overwrite=overwrite
+            repeatable,
+            resolved,
+            folders,
+            origin=origin,
+            kind=kind,
+            overwrite=overwrite,
+            table_format=table_format,
         )
         run = load_run(out)
     if (broken := run.meta["broken_off"]) is not None:

@@ -19,7 +19,7 @@ from fgtrack.meaning.assumed import assumed, is_open, source_of
 from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, with_last
-from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run
+from fgtrack.runs import MemoryRun, Run, RunWriter, TableFormat, path_from_run
 from fgtrack.tracking.parts import TrackerParts, check_sensor
 from fgtrack.tracking.tracker import MultiObjectTracker
 
@@ -90,13 +90,15 @@ def replay(
     on_tick: Callable[[TickReport], None] = lambda report: None,
     overwrite: bool = False,
     observed: Mapping[str, Callable[[TrackerParts], TrackerParts]] | None = None,
+    table_format: TableFormat = "csv",
 ) -> list[dict[str, object]]:
     """Run each estimator in `folders` over the messages into its run folder; return the contents of each meta.json.
 
     `messages` returns an iterator in receipt order. If the iterator raises `DataError`,
     the run ends there, and `broken_off` in the meta data contains the reason. `origin`
     and `kind` are path and format of the input. `observed` is the argument of
-    `build_tracker`, by estimator.
+    `build_tracker`, by estimator. `table_format` is the format of the tables in the run
+    folders.
 
     Raises `DataError` for an input without messages for the tracker.
     """
@@ -106,7 +108,8 @@ def replay(
         for estimator, folder in folders.items():
             chosen = replace(config, estimator=estimator)
             tracker = build_tracker(chosen, (observed or {}).get(estimator))
-            writer = RunWriter(folder, *_head(chosen, origin, kind, folder), overwrite)
+            head = _head(chosen, origin, kind, folder)
+            writer = RunWriter(folder, *head, overwrite, table_format)
             runs.append((chosen, tracker, stack.enter_context(writer)))
         return [
             _drive(tracker, messages(), chosen, writer, origin, on_tick)

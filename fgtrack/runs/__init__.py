@@ -1,7 +1,8 @@
 """The run folder `fgtrack-run/1`, through which the evaluation gets the tracker's results: writer, reader, columns."""
 
+from fgtrack.runs.columns import Columns
 from fgtrack.runs.memory import MemoryRun
-from fgtrack.runs.reader import Columns, Run, load_run
+from fgtrack.runs.reader import Run, load_run
 from fgtrack.runs.schema import (
     COLUMNS,
     COVARIANCE_COLUMNS,
@@ -12,6 +13,7 @@ from fgtrack.runs.schema import (
 from fgtrack.runs.timing import Node, ready_times
 from fgtrack.runs.writer import (
     RunWriter,
+    TableFormat,
     check_run,
     digest,
     is_run_folder,
@@ -29,6 +31,7 @@ __all__ = [
     "RUN_FORMAT",
     "Run",
     "RunWriter",
+    "TableFormat",
     "Columns",
     "check_run",
     "digest",

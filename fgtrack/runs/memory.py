@@ -4,7 +4,8 @@ import hashlib
 from collections.abc import Sequence
 from functools import cached_property
 
-from fgtrack.runs.reader import Run, parse_csv
+from fgtrack.runs.csv_table import parse_csv
+from fgtrack.runs.reader import Run
 from fgtrack.runs.rows import Row, text, text_header
 from fgtrack.runs.schema import COLUMNS
 from fgtrack.runs.sink import RunSink

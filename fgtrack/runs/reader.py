@@ -1,74 +1,42 @@
 """Reads a run folder; each table becomes columns."""
 
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from html import escape
-from io import BytesIO, TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from warnings import catch_warnings
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from ruamel.yaml.error import YAMLError
 
-from fgtrack.core.errors import DataError
-from fgtrack.core.files import open_file, read_whole
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.core.yaml_text import safe_yaml
 from fgtrack.inputs.errors import one_line
+from fgtrack.runs.columns import Columns
+from fgtrack.runs.csv_table import parse_csv, read_csv
 from fgtrack.runs.rows import text_header
 from fgtrack.runs.schema import (
-    ADDED_COLUMNS,
     COLUMNS,
-    NO_TRACK,
     OPTIONAL_TABLES,
     RUN_FORMAT,
-    SCORE,
-    Column,
     column,
-    column_type,
 )
-from fgtrack.runs.writer import LARGEST_META_MB, RunWriter, path_from_run
+from fgtrack.runs.writer import (
+    LARGEST_META_MB,
+    NO_PYARROW,
+    RunWriter,
+    TableFormat,
+    path_from_run,
+)
 
 if TYPE_CHECKING:  # takes half a second to import
     from pandas import DataFrame
-
-
-class Columns(dict[str, Column]):
-    """Columns of a table by name: read-only NumPy arrays of shape (rows,); `len` is the number of columns.
-
-    In a float column, an empty cell and a number beyond 1e60 are NaN. In an integer
-    column, an empty cell is `NO_TRACK`.
-    """
-
-    def __init__(self, columns: Mapping[str, Column]) -> None:
-        super().__init__({name: values.view() for name, values in columns.items()})
-        for values in self.values():
-            values.flags.writeable = False
-
-    @property
-    def num_rows(self) -> int:
-        """Length of every column."""
-        return len(next(iter(self.values()), ()))
-
-    def equals(self, other: "Columns") -> bool:
-        """True if both tables have the same columns, equal to the bit; NaN equals NaN."""
-        return list(self) == list(other) and all(
-            np.array_equal(
-                self[name], other[name], equal_nan=column_type(name) is float
-            )
-            for name in self
-        )
-
-    def where(self, rows: BoolArray | IntArray) -> "Columns":
-        """Return the rows selected by a mask, shape (rows,), or by indices."""
-        return Columns({name: values[rows] for name, values in self.items()})
 
 
 def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
@@ -77,7 +45,7 @@ def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
     def made(run: "Run") -> "DataFrame":
         import pandas
 
-        return pandas.DataFrame(run.tables[table])
+        return pandas.DataFrame(dict(run.tables[table]))
 
     made.__doc__ = doc
     return cached_property(made)
@@ -196,18 +164,30 @@ class Run:
         """Return the run in which `tables` replace the tables of the same names. Its other tables stay."""
         return replace(self, tables={**self.tables, **tables})
 
-    def save(self, path: Path | str, *, overwrite: bool = False) -> None:
+    def save(
+        self,
+        path: Path | str,
+        *,
+        overwrite: bool = False,
+        table_format: TableFormat = "csv",
+    ) -> None:
         """Write the run folder `path`; raises `CallError` if something exists there, as `RunWriter`."""
-        meta = dict(self.meta)
+        meta = {key: value for key, value in self.meta.items() if key != "tables"}
         if self.recording is not None:
             meta["input"] = {
                 **meta["input"],
                 "path_from_run": path_from_run(str(self.recording), Path(path)),
             }
-        with RunWriter(path, self.config_text, meta, overwrite=overwrite) as writer:
+        with RunWriter(
+            path,
+            self.config_text,
+            meta,
+            overwrite=overwrite,
+            table_format=table_format,
+        ) as writer:
             for table, columns in self.tables.items():
                 if columns.num_rows:
-                    writer.write_rows(table, _lines(table, columns, writer.is_scored))
+                    writer.write_columns(table, columns)
             writer.finish(meta)
 
 
@@ -232,12 +212,19 @@ def load_run(path: Path | str) -> Run:
             f"{file}: does not contain format {RUN_FORMAT!r}, so this is not a run folder"
         )
     complete = bool(meta.get("complete"))
+    table_format = meta.get("tables", "csv")
+    if table_format not in get_args(TableFormat):
+        raise DataError(
+            f"{file}: its tables have the format {table_format!r}, which this version does not read"
+        )
+    read = _table_reader(table_format, file)
     tables = {
-        name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS
+        name: _read_table(read, path / f"{name}.{table_format}", name, complete)
+        for name in COLUMNS
     }
     if (np.diff(tables["timing"]["tick"]) <= 0).any():
         raise DataError(
-            f"{path / 'timing.csv'}: its ticks do not increase, repeat the run"
+            f"{path}/timing.{table_format}: its ticks do not increase, repeat the run"
         )
     has_config = complete or config.exists()
     return Run(
@@ -250,86 +237,28 @@ def load_run(path: Path | str) -> Run:
     )
 
 
-def _read_table(path: Path, table: str, complete: bool) -> Columns:
+def _table_reader(
+    table_format: TableFormat, file: Path
+) -> Callable[[Path, str, bool], Columns]:
+    """Return the reader of `table_format`, which gets a path, the table, and True for a complete run."""
+    if table_format == "csv":
+        return read_csv
+    try:
+        from fgtrack.runs.parquet_table import read_parquet
+    except ModuleNotFoundError as error:
+        raise CallError(f"{file}: {NO_PYARROW}") from error
+    return read_parquet
+
+
+def _read_table(
+    read: Callable[[Path, str, bool], Columns], path: Path, table: str, complete: bool
+) -> Columns:
     # A run that was killed at its beginning lacks tables.
     if (table in OPTIONAL_TABLES or not complete) and not path.exists():
         return parse_csv(table, text_header(table))
     try:
-        with open_file(path) as file:
-            content = file.read()
-        if complete and (not content.endswith(b"\n") or content.endswith(b"\n\n")):
-            raise DataError(f"{path}: breaks off in its last row, repeat the run")
-        return parse_csv(
-            table, content[: content.rfind(b"\n") + 1] or text_header(table)
-        )
+        return read(path, table, complete)
     except (OSError, ValueError, OverflowError) as error:
         raise DataError(
             f"{path}: cannot be read ({one_line(error)}), repeat the run"
         ) from error
-
-
-def parse_csv(table: str, content: bytes | bytearray) -> Columns:
-    """Return the columns of a table from the content of its CSV file; raises `ValueError` for other content."""
-    names = COLUMNS[table]
-    text = TextIOWrapper(BytesIO(content), newline="")
-    written = tuple(text.readline().rstrip("\n").split(","))
-    if (
-        tuple(name for name in names if name in written or name not in ADDED_COLUMNS)
-        != written
-    ):
-        raise ValueError(f"the columns must be {','.join(names)}")
-    # NumPy warns about a file without rows.
-    with catch_warnings(action="ignore", category=UserWarning):
-        cells = np.loadtxt(
-            text,
-            dtype=[(name, _TYPES[column_type(name)]) for name in written],
-            delimiter=",",
-            quotechar='"',
-            comments=None,
-            converters=dict(enumerate(map(_converter, written))),
-            ndmin=1,
-        )
-    # Runs of fgtrack 0.2 lack these columns.
-    added = {
-        name: [ADDED_COLUMNS[name]] * len(cells)
-        for name in names
-        if name not in written
-    }
-    return Columns(
-        {
-            name: column(name, added[name] if name in added else cells[name])
-            for name in names
-        }
-    )
-
-
-_TYPES = {str: object, int: np.int64, float: np.float64}
-
-
-def _converter(name: str) -> Callable[[str], str | int | float]:
-    """Return the function that converts a cell of the column `name`."""
-    if column_type(name) is float:
-        return lambda cell: float(cell) if cell else math.nan
-    return (
-        str
-        if column_type(name) is str
-        else lambda cell: int(cell) if cell or name != "track_id" else NO_TRACK
-    )
-
-
-def _lines(table: str, columns: Columns, is_scored: bool) -> str:
-    """Return the columns as lines of the table's CSV file; floats have 17 significant digits."""
-    import pandas
-
-    frame = pandas.DataFrame(columns)
-    if table == "tracks" and not is_scored:
-        frame = frame.drop(columns=SCORE)
-    if table == "updates":
-        frame["track_id"] = (
-            frame["track_id"].astype("Int64").replace(NO_TRACK, pandas.NA)
-        )
-    return str(
-        frame.to_csv(
-            header=False, index=False, float_format="%.17g", lineterminator="\n"
-        )
-    )

@@ -18,7 +18,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.runs.schema import COLUMNS, COVARIANCE_STATES
+from fgtrack.runs.schema import COLUMNS, COVARIANCE_STATES, written_columns
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
@@ -145,8 +145,7 @@ def text(table: str, cells: Sequence[Row]) -> str:
 
 def text_header(table: str, is_scored: bool = True) -> bytes:
     """Return the first line of the table's CSV file; `is_scored` as in `RunSink`."""
-    names = COLUMNS[table] if is_scored or table != "tracks" else COLUMNS[table][:-1]
-    return (",".join(names) + "\n").encode()
+    return (",".join(written_columns(table, is_scored)) + "\n").encode()
 
 
 @lru_cache

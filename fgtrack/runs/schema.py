@@ -116,6 +116,14 @@ _INTEGERS = frozenset(
         *("index", "num_measured", "num_tracks", "num_detections"),
     }
 )
+
+
+def written_columns(table: str, is_scored: bool) -> tuple[str, ...]:
+    """Names of the columns in the file of `table`; `is_scored` as in `RunSink`."""
+    names = COLUMNS[table]
+    return names if is_scored or table != "tracks" else names[:-1]
+
+
 #: Largest number of a column, whose square is finite; no measurement and no state exceeds it.
 _LARGEST = 1e60
 
@@ -131,6 +139,8 @@ def column(name: str, cells: Sequence[Any] | Column) -> Column:
     None is an empty cell, and a number beyond 1e60 becomes NaN.
     """
     kind = column_type(name)
+    if kind is int and isinstance(cells, np.ndarray) and cells.dtype == np.int64:
+        return cells
     if kind is str:
         return np.array(["" if cell is None else cell for cell in cells], dtype=np.str_)
     if kind is int:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgtrack.core.types import IntArray
-from fgtrack.runs.reader import Columns
+from fgtrack.runs.columns import Columns
 
 _END_NS = int(np.iinfo(np.int64).max)
 

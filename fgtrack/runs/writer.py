@@ -4,35 +4,59 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
-from io import BufferedWriter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Literal, Protocol, Self, get_args
 
-from fgtrack.core.errors import DataError
-from fgtrack.core.files import open_file, read_whole
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_whole
 from fgtrack.core.output import check_output, locked_folder, write_error, write_file
-from fgtrack.runs.rows import Row, text, text_header
+from fgtrack.runs.columns import Columns
+from fgtrack.runs.csv_table import CsvTable, csv_blocks
+from fgtrack.runs.rows import Row
 from fgtrack.runs.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.runs.sink import RunSink
 
+NO_PYARROW = (
+    "pyarrow is not installed, and Parquet tables need it: `pip install pyarrow`"
+)
 LARGEST_META_MB = 16.0
 """Largest meta.json or config.yaml that is read; both normally have some kB."""
 _META = "meta.json"
 #: Folder of a new run inside the folder of an older run.
 _STAGE = "new.part"
-_FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", _META)
+TableFormat = Literal["csv", "parquet"]
+"""Format of the tables of a run folder, and suffix of their files."""
+_FILES = (
+    *(f"{table}.{suffix}" for table in COLUMNS for suffix in get_args(TableFormat)),
+    *("metrics.json", "config.yaml", _META),
+)
+
+
+class TableWriter(Protocol):
+    """Writer of the file of one table."""
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """Append `rows`."""
+
+    def append_columns(self, columns: Columns) -> None:
+        """Append the rows of `columns`."""
+
+    def close(self) -> None:
+        """Complete the file."""
 
 
 class RunWriter(RunSink):
     """Context manager that writes the run folder `path`, and keeps the folder locked until it is closed.
 
-    The rows of a tick are in the files within 0.2 s. A killed run leaves readable
-    files, and a `meta.json` with `"complete": false`. An older run stays until
-    `finish`: the new run is written into the subfolder `new.part`. Other files in the
-    folder stay.
+    The rows of a tick are in the CSV files within 0.2 s; a Parquet file is complete
+    after `finish`. A killed run leaves readable CSV files, and a `meta.json` with
+    `"complete": false`. An older run stays until `finish`: the new run is written into
+    the subfolder `new.part`. Other files in the folder stay.
+
+    Raises `CallError` for the format `parquet` without the package pyarrow.
     """
 
     def __init__(
@@ -42,14 +66,20 @@ class RunWriter(RunSink):
         meta: Mapping[str, object] | None = None,
         smoothed_lag_s: float | None = None,
         overwrite: bool = False,
+        table_format: TableFormat = "csv",
     ) -> None:
         super().__init__(config_text, meta, smoothed_lag_s)
+        self._writer_of = table_writer(table_format)
+        self._suffix = table_format
+        if table_format != "csv":
+            self._meta["tables"] = table_format
         self.path = Path(path)
         self._folder: Path | None = None  # folder of the files, after the first tick
-        self._files: dict[str, BufferedWriter] = {}
+        self._files: dict[str, TableWriter] = {}
         with ExitStack() as stack:
             stack.enter_context(locked_folder(self.path))
             check_run(self.path, overwrite)
+            self._open_tables = stack.enter_context(ExitStack())
             self._open = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -94,21 +124,25 @@ class RunWriter(RunSink):
         folder.rmdir()
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        self.write_rows(table, text(table, rows))
+        with self._written(table) as file:
+            file.append(rows)
 
-    def write_rows(self, table: str, lines: str) -> None:
-        """Append `lines` to the CSV file of `table`."""
-        folder = self._begin()
+    def write_columns(self, table: str, columns: Columns) -> None:
+        """Append the rows of `columns` to the file of `table`."""
+        with self._written(table) as file:
+            file.append_columns(columns)
+
+    @contextmanager
+    def _written(self, table: str) -> Iterator[TableWriter]:
+        """Return the writer of `table`; an `OSError` becomes the error of an output."""
+        path = self._begin() / f"{table}.{self._suffix}"
         try:
             if table not in self._files:
-                self._files[table] = self._open.enter_context(
-                    (folder / f"{table}.csv").open("wb")
-                )
-                self._files[table].write(text_header(table, self.is_scored))
-            self._files[table].write(lines.encode())
-            self._files[table].flush()
+                self._files[table] = self._writer_of(path, table, self.is_scored)
+                self._open_tables.callback(self._files[table].close)
+            yield self._files[table]
         except OSError as error:
-            raise write_error(folder / f"{table}.csv", error) from error
+            raise write_error(path, error) from error
 
     def _begin(self) -> Path:
         """Return the folder of the files, which are created at the first call, with the first tick.
@@ -128,14 +162,19 @@ class RunWriter(RunSink):
             self._write_meta(folder)
             write_file(folder / "config.yaml", self._config_text)
             for table in COLUMNS.keys() - OPTIONAL_TABLES:
-                self.write_rows(table, "")
+                self._append(table, ())
         return self._folder
 
     def _write_meta(self, folder: Path) -> None:
         write_file(folder / _META, json.dumps(self._meta, indent=2) + "\n")
 
     def _digest(self) -> str:
-        return digest(self._folder or self.path)
+        folder = self._folder or self.path
+        try:
+            self._open_tables.close()
+        except OSError as error:
+            raise write_error(folder, error) from error
+        return digest(folder)
 
 
 def check_run(path: Path, overwrite: bool) -> None:
@@ -158,13 +197,41 @@ def write_metrics(path: Path, metrics: Mapping[str, object]) -> None:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of the bytes of tracks.csv followed by updates.csv in the run folder `path`, in hex."""
+    """SHA-256 of tracks.csv followed by updates.csv in the run folder `path`, in hex.
+
+    Parquet files have the digest of the CSV files with the same rows.
+    """
     sha = hashlib.sha256()
-    for name in ("tracks.csv", "updates.csv"):
-        with open_file(path / name) as file:
-            while block := file.read(1 << 20):
-                sha.update(block)
+    for table in ("tracks", "updates"):
+        for block in _blocks(path, table):
+            sha.update(block)
     return sha.hexdigest()
+
+
+def _blocks(path: Path, table: str) -> Iterator[bytes]:
+    """Return the bytes of the CSV file of `table`."""
+    if (path / f"{table}.csv").exists():
+        return csv_blocks(path / f"{table}.csv")
+    from fgtrack.runs.parquet_table import parquet_blocks
+
+    return parquet_blocks(path / f"{table}.parquet", table)
+
+
+def table_writer(
+    table_format: TableFormat,
+) -> Callable[[Path, str, bool], TableWriter]:
+    """Return the writer of `table_format`; raises `CallError` for an unknown format, or if its package is missing."""
+    if table_format == "csv":
+        return CsvTable
+    if table_format not in get_args(TableFormat):
+        raise CallError(
+            f"{table_format!r}: is not a format of tables, give csv or parquet"
+        )
+    try:
+        from fgtrack.runs.parquet_table import ParquetTable
+    except ModuleNotFoundError as error:
+        raise CallError(NO_PYARROW) from error
+    return ParquetTable
 
 
 def is_run_folder(path: Path) -> bool:
