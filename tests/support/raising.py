@@ -11,6 +11,7 @@ import numpy as np
 from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList, FloatArray
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.filters.stepwise_replay import StepwiseReplay
 from fgtrack.estimation.filters.track_initiation import Initiated
 from fgtrack.estimation.registry import ESTIMATORS, Claims
 from fgtrack.models.measurement import MeasurementModel
@@ -141,12 +142,8 @@ def points(tracker: Tracker) -> list[Point]:
             )
         )
     if hasattr(bank, "_rows") and hasattr(bank, "_allocate"):
-        owners.append(
-            (
-                bank,
-                "_allocate _fused _fused_outside _replayed _replay_step _keep_outside",
-            )
-        )
+        owners.append((bank, "_allocate _fused _fused_outside _keep_outside"))
+        owners.append((StepwiseReplay, "fused _replay_step _expected"))
     return [
         Point(owner, name)
         for owner, names in owners

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -31,10 +31,18 @@ from fgtrack.estimation.base import (
     stacks,
 )
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
-from fgtrack.estimation.filters.propagation import kinematic_states, wrapped
+from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf
+from fgtrack.estimation.filters.stepwise_replay import (
+    FUSED,
+    KERNELS,
+    NO_ROOM,
+    STATUS,
+    Outside,
+    StepwiseReplay,
+    stack_of,
+)
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.estimation.object_bank import (
     ObjectBank,
@@ -42,41 +50,12 @@ from fgtrack.estimation.object_bank import (
     as_unchanged,
     changing_nothing,
 )
-from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.robust import compiled_form
 
-_KERNELS = "fgtrack.estimation.kernels.replay"
-#: Statuses by the number of the outcome in the compiled loops.
-_STATUS = (
-    UpdateStatus.FAILED,
-    UpdateStatus.TOO_OLD,
-    UpdateStatus.IN_SEQUENCE,
-    UpdateStatus.OUT_OF_SEQUENCE,
-)
-_FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
 #: Column of `labels` at which the codes of the components begin, see `kernels.replay_arrays`.
 CODES = 3
-Stack = tuple[IntArray, FloatArray, int, FloatArray, FloatArray]
-"""Measurements as compiled loops take them, see `fgtrack.models.measurement_kernels.Stack`."""
-
-
-class Outside(NamedTuple):
-    """A step that compiled loops cannot replay alone."""
-
-    measurement: Measurement | None
-    """None for the first step, which is the prior."""
-    search: TrackInitiation | None
-    """Initiation with all measurements up to this step; None if the direction of travel is known."""
-
-    @property
-    def is_plugin(self) -> bool:
-        """True if a plug-in models the measurement."""
-        return self.measurement is not None and not self.measurement.model.is_compiled
-
-
-_INSIDE = Outside(None, None)
 
 
 class ReplayBank(Stateful):
@@ -297,8 +276,8 @@ class ReplayBank(Stateful):
             y, S, nis = np.empty((m, k)), np.empty((m, k, k)), np.empty(m)
             status = np.empty(m, dtype=np.int64)
             now = self._lag_ns, self._start_ns, stamp_ns
-            seen = _stack(one), one.measured
-            fuse = kernels(_KERNELS).fuse
+            seen = stack_of(one), one.measured
+            fuse = kernels(KERNELS).fuse
         except Exception as error:
             raise as_unchanged(error, track_ids) from error
         model, results = (self._kind, self._noise), (y, S, nis, status)
@@ -306,7 +285,7 @@ class ReplayBank(Stateful):
             return _results(y, S, nis, status)
         outcomes = Outcomes()
         for is_full in (False, True):
-            chosen = ((status == _NO_ROOM) == is_full).nonzero()[0]
+            chosen = ((status == NO_ROOM) == is_full).nonzero()[0]
             ids = [track_ids[k] for k in chosen.tolist()]
             if is_full:
                 part = replace(one, z=one.z[chosen], R=one.R[chosen])
@@ -360,7 +339,7 @@ class ReplayBank(Stateful):
             np.empty((m, n, n)),
         )
         at = rows, self._start_ns, stamp_ns, is_present
-        count = kernels(_KERNELS).ahead(
+        count = kernels(KERNELS).ahead(
             self._kind, self._noise, self._arrays, *at, means, covariances, known
         )
         return count, known, means, covariances
@@ -379,8 +358,9 @@ class ReplayBank(Stateful):
             kept = [array[row].copy() for array in self._arrays]
             steps, is_fused = dict(self._outside.get(row, {})), False
             try:
-                result = self._replayed(row, one, steps)
-                if result is not None and result.status in _FUSED:
+                replay = StepwiseReplay(self._motion, self._arrays, row, steps)
+                result = replay.fused(one, self._lag_ns, self._start_ns)
+                if result is not None and result.status in FUSED:
                     self._keep_outside(row, steps)
                     is_fused = True
             except np.linalg.LinAlgError:
@@ -392,126 +372,6 @@ class ReplayBank(Stateful):
             if result is None:
                 self._allocate(0, 2 * self._shape[1])
         return [result] if result else self._fused_outside(track_id, one)
-
-    def _replayed(
-        self, row: int, one: Measurement, steps: dict[int, Outside]
-    ) -> UpdateResult | None:
-        """Insert a measurement into the steps of a track and re-filter the later measurements. None if all
-        slots are in use.
-
-        `steps` are the steps of this track in `_outside`. Raises `numpy.linalg.LinAlgError` if a measurement
-        cannot be fused.
-        """
-        order, _, _, windows, _, _ = self._arrays
-        times_ns = self._lag_ns, self._start_ns, one.stamp_ns
-        stack = _stack(replace(one, z=one.z[None], R=one.R[None]))
-        index = kernels(_KERNELS).insert(self._arrays, np.array([row]), times_ns, stack)
-        if index < 0:
-            return None if -index == _NO_ROOM else UpdateResult(_STATUS[-index])
-        last = int(windows[row, 0])
-        steps[int(order[row, index])] = Outside(one, None)
-        self._replay_step(row, index, steps)
-        y, S, nis = self._expected(row, index, last, one, steps)
-        for later in range(index + 1, last + 1):
-            self._replay_step(row, later, steps)
-        is_newest = one.stamp_ns >= windows[row, 2]
-        newest_ns = max(int(windows[row, 2]), one.stamp_ns)
-        start_ns = max(int(windows[row, 1]), newest_ns - self._lag_ns)
-        windows[row] = last + 1, start_ns, newest_ns
-        status = UpdateStatus.IN_SEQUENCE if is_newest else UpdateStatus.OUT_OF_SEQUENCE
-        return UpdateResult(status, y, nis, S)
-
-    def _replay_step(self, row: int, index: int, steps: dict[int, Outside]) -> None:
-        """Predict a step and fuse its measurement. While the direction is sought, the state comes from the line
-        instead.
-
-        Raises `numpy.linalg.LinAlgError` if the measurement cannot be fused.
-        """
-        n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
-        before, slot = order[row, index - 1 : index + 1].tolist()
-        step, k = steps.get(slot, _INSIDE), int(labels[row, slot, 1])
-        y, H = np.empty(k), np.empty((k, n))
-        loops, tracks = kernels(_KERNELS), np.array([row])
-        loops.predict_step(self._kind, self._noise, self._arrays, tracks, index)
-        if step.measurement is not None and step.is_plugin:
-            y, H = (
-                np.array(each, dtype=np.float64, order="C")
-                for each in step.measurement.model.linearised(
-                    step.measurement.z, states[row, slot, 0], step.measurement.pose
-                )
-            )
-        if not loops.correct_step(
-            self._kind, self._arrays, tracks, index, step.is_plugin, y, H
-        ):
-            raise np.linalg.LinAlgError("a measurement cannot be fused")
-        search = steps.get(before, _INSIDE).search
-        if step.measurement is None:
-            return
-        if search is not None:
-            search = search.with_measurement(step.measurement)
-        if search is not None and search.line is not None:
-            mean, states[row, slot, 1 : n + 1] = search.state()
-            states[row, slot, 0] = wrapped(self._motion, mean)
-        steps[slot] = Outside(step.measurement, search)
-
-    def _expected(
-        self,
-        row: int,
-        index: int,
-        last: int,
-        one: Measurement,
-        steps: dict[int, Outside],
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """Return innovation y (k,), its covariance S (k, k) and NIS of the new step at `index`, given all other
-        steps.
-
-        Raises `numpy.linalg.LinAlgError` if S is not positive definite.
-        """
-        n = self._motion.dim
-        now = self._retrodicted_along_line(row, index, last, one.stamp_ns, steps)
-        if now is None:
-            now = np.empty((n + 1, n))
-            if not kernels(_KERNELS).retrodict(
-                self._kind, self._noise, self._arrays, np.array([row]), index, last, now
-            ):
-                raise np.linalg.LinAlgError("a prediction has no root")
-        y, H = one.model.linearised(one.z, now[0], one.pose)
-        S, nis, _ = kernels("fgtrack.estimation.kernels.kalman").innovations(
-            np.array(y, ndmin=2),
-            np.array(H, dtype=np.float64, order="C", ndmin=3),
-            now[None, 1:],
-            np.array([0]),
-            np.array(one.R, dtype=np.float64, order="C", ndmin=3),
-            one.measured,
-        )
-        if np.isnan(nis[0]):
-            raise np.linalg.LinAlgError("innovation covariance not positive definite")
-        return y, S[0], float(nis[0])
-
-    def _retrodicted_along_line(
-        self,
-        row: int,
-        index: int,
-        last: int,
-        stamp_ns: int,
-        steps: dict[int, Outside],
-    ) -> FloatArray | None:
-        """Return the state (n + 1, n) at a stamp given all later steps, if a later step lies along a line; else
-        None.
-        """
-        n, (order, labels, states, _, _, _) = self._motion.dim, self._arrays
-        links = list[Link]()
-        for slot in reversed(order[row, index + 1 : last + 1].tolist()):
-            own = states[row, slot]
-            predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
-            stamp_of_slot_ns = int(labels[row, slot, 0])
-            links.insert(0, (stamp_of_slot_ns, own[0], own[1 : n + 1], predicted))
-            search = steps.get(slot, _INSIDE).search
-            if search is not None and search.line is not None:
-                _, mean, covariance, _ = links[-1]
-                mean, covariance = smoothed_back(self._motion, links, mean, covariance)
-                return np.vstack(search.retrodicted(stamp_ns, mean, covariance))
-        return None
 
     def _keep_outside(self, row: int, steps: dict[int, Outside]) -> None:
         """Keep the `steps` of a track that its window needs. If none is left, the compiled loop replays the track."""
@@ -526,29 +386,17 @@ class ReplayBank(Stateful):
             self._outside.pop(row, None)
 
 
-def _stack(one: Measurement) -> Stack:
-    """Return a stack of measurements, z (m, k) and R (m, k, k), as compiled loops take it."""
-    loss, width = compiled_form(one.loss, one.z.shape[-1])
-    return (
-        one.model.codes,
-        np.array([*one.pose, width]),
-        loss,
-        np.ascontiguousarray(one.z, dtype=np.float64),
-        np.ascontiguousarray(one.R, dtype=np.float64),
-    )
-
-
 def _results(
     y: FloatArray, S: FloatArray, nis: FloatArray, status: IntArray
 ) -> list[UpdateResult]:
     """Return the results of innovations (m, k), covariances (m, k, k), NIS (m,) and outcomes (m,) of the compiled
     loop.
     """
-    statuses = list(map(_STATUS.__getitem__, status.tolist()))
+    statuses = list(map(STATUS.__getitem__, status.tolist()))
     results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
     if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
         results = [
-            each if each.status in _FUSED else UpdateResult(each.status)
+            each if each.status in FUSED else UpdateResult(each.status)
             for each in results
         ]
     return results
