@@ -3,8 +3,8 @@
 The names below are public.
 """
 
+from fgtrack.config.motion import NOISE_HZ, InitiationConfig, MotionConfig
 from fgtrack.config.settings import (
-    NOISE_HZ,
     SMOOTHERS,
     ClockConfig,
     Config,
@@ -12,9 +12,7 @@ from fgtrack.config.settings import (
     Effective,
     EgoConfig,
     FilterConfig,
-    InitiationConfig,
     MapConfig,
-    MotionConfig,
 )
 from fgtrack.models.sensors import Correlation, Filter, Mount, Score
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis

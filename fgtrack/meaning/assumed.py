@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fgtrack.config.motion import NOISE_HZ, MotionConfig
 from fgtrack.config.recorded import Recorded, RecordedSensor, recorded
-from fgtrack.config.settings import NOISE_HZ, Config, FilterConfig, MotionConfig
+from fgtrack.config.settings import Config, FilterConfig
 from fgtrack.config.yaml_file import SMALLEST, plain
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message

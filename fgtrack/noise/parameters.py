@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from fgtrack.config.settings import Config, MotionConfig
+from fgtrack.config.motion import MotionConfig
+from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import plain
 from fgtrack.core.types import FloatArray
 from fgtrack.models.correlated_errors import with_correlated_errors

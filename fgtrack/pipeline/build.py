@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.config.settings import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
+from fgtrack.config.motion import NOISE_HZ
+from fgtrack.config.settings import SMOOTHERS, Config, Defect, MapConfig
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, period_ns, seconds

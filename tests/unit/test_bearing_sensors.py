@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from support.tracking import START_NS, ms
 
-from fgtrack.config.settings import Config, MotionConfig
+from fgtrack.config.motion import MotionConfig
+from fgtrack.config.settings import Config
 from fgtrack.core.types import (
     Detection,
     DetectionList,

@@ -8,7 +8,8 @@ from support.directions import PERIOD_NS, START, positions
 from support.examples import slow
 
 import fgtrack
-from fgtrack.config.settings import Config, InitiationConfig, MapConfig, MotionConfig
+from fgtrack.config.motion import InitiationConfig, MotionConfig
+from fgtrack.config.settings import Config, MapConfig
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW
 from fgtrack.estimation.base import Estimator, Measurement, Start

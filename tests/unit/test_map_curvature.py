@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import fgtrack
+from fgtrack.config.motion import MotionConfig
 from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config, MotionConfig
+from fgtrack.config.settings import Config
 from fgtrack.core.types import YAW_RATE
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.models.motion import CTRV

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgtrack.config.motion import MotionConfig
 from fgtrack.config.reading import read_scenario
-from fgtrack.config.settings import Config, MapConfig, MotionConfig
+from fgtrack.config.settings import Config, MapConfig
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.pipeline.replay import replay, replay_in_memory
