@@ -419,8 +419,6 @@ def test_the_command_names_the_model_and_the_promise(
 ) -> None:
     """Without estimators, which take most of the time. Their promises about streams break as well."""
     monkeypatch.setattr(ESTIMATORS, "loaded", dict[str, object])
-    assert run(["verify"]) == 0
-    assert "bearing_rad" in capsys.readouterr().out
     sabotage(monkeypatch, CTRV(), NOISE, (2, 2), 1.1)
     wrong_jacobian(monkeypatch, "bearing_rad", CTRV.state_names, 1, -1.0)
     assert run(["verify"]) == 1

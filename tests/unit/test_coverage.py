@@ -257,3 +257,20 @@ def test_exact_and_gridded_positions_recur_everywhere(step_m: float) -> None:
     assert result.max_range_m is None
     assert result.detection_probability == pytest.approx(0.9)
     assert result.clutter_per_list < 0.1
+
+
+def test_exact_positions_of_a_parked_car_make_no_clutter_of_a_moving_one() -> None:
+    """Most misfits are exactly 0, and the coordinates form no grid: only the floor of the scatter is left."""
+    messages = []
+    for k in range(300):
+        t_s = k / 30.0
+        x_m, y_m = 10.0 + 8.0 * t_s + np.sin(0.9 * t_s), 8.0 + 2.0 * np.sin(t_s)
+        objects = [
+            Detection(x_m=30.0, y_m=0.0),
+            Detection(x_m=float(x_m), y_m=float(y_m)),
+        ]
+        stamp_ns = k * 1_000_000_000 // 30
+        messages.append(DetectionList("one", stamp_ns, stamp_ns, objects, "ego"))
+    result = coverage(messages).persistence
+    assert result is not None
+    assert result.clutter_per_list < 0.1
