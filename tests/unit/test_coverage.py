@@ -261,7 +261,7 @@ def test_exact_and_gridded_positions_recur_everywhere(step_m: float) -> None:
 
 def test_exact_positions_of_a_parked_car_make_no_clutter_of_a_moving_one() -> None:
     """Most misfits are exactly 0, and the coordinates form no grid: only the floor of the scatter is left."""
-    messages = []
+    messages: list[Message] = []
     for k in range(300):
         t_s = k / 30.0
         x_m, y_m = 10.0 + 8.0 * t_s + np.sin(0.9 * t_s), 8.0 + 2.0 * np.sin(t_s)
