@@ -35,10 +35,10 @@ class _Sorter(Generic[_Item]):
     """
 
     def __init__(self) -> None:
-        #: Items from the beginning, until there are enough of them to be certainly right.
-        self._head: list[_Item] | None = []
-        #: Items whose receipts are far from those before.
-        self._far: list[_Item] = []
+        #: Items from the beginning, until there are enough of them to be certainly right, with True for a receipt.
+        self._head: list[tuple[_Item, bool]] | None = []
+        #: Items since a receipt that is far from the receipts before, with True for a receipt.
+        self._far: list[tuple[_Item, bool]] = []
         self._num_near = 0
         self._num_far = 0
         self._newest_ns: int | None = None
@@ -46,8 +46,10 @@ class _Sorter(Generic[_Item]):
 
     def neutral(self, item: _Item) -> Iterator[tuple[_Item, bool]]:
         """Take an item without a receipt, and yield the items that are decided now, each with True if it is wrong."""
-        if self._head:
-            self._head.append(item)
+        if self._far:
+            self._far.append((item, False))
+        elif self._head:
+            self._head.append((item, False))
         else:
             yield item, False
 
@@ -56,7 +58,7 @@ class _Sorter(Generic[_Item]):
         newest_ns = receipt_ns if self._newest_ns is None else self._newest_ns
         far_ns = _FAR_NS if newest_ns else _FAR_FROM_ZERO_NS
         if abs(receipt_ns - newest_ns) > far_ns:
-            self._far.append(item)
+            self._far.append((item, True))
             self._num_far += 1
             self._far_newest_ns = receipt_ns
             yield from self._decided()
@@ -72,11 +74,11 @@ class _Sorter(Generic[_Item]):
         self._newest_ns = max(newest_ns, receipt_ns)
         self._num_near += 1
         if self._head is None:
-            yield from ((each, True) for each in far)
+            yield from far
             yield item, False
             return
-        yield from ((each, True) for each in far)
-        self._head.append(item)
+        yield from far
+        self._head.append((item, True))
         if self._num_near > _MOST:
             yield from self._release_head()
 
@@ -86,7 +88,7 @@ class _Sorter(Generic[_Item]):
             yield from self._replace_head()
         is_wrong = self._num_far <= self._most
         yield from self._release_head()
-        yield from ((each, is_wrong) for each in self._far)
+        yield from ((each, counts and is_wrong) for each, counts in self._far)
 
     @property
     def _most(self) -> int:
@@ -105,7 +107,7 @@ class _Sorter(Generic[_Item]):
 
         There are many more items with far receipts than first items.
         """
-        yield from ((each, True) for each in self._head or ())
+        yield from self._head or ()
         self._head = None
         self._num_near = 0
         yield from self._accept_far()
@@ -113,14 +115,14 @@ class _Sorter(Generic[_Item]):
     def _accept_far(self) -> Iterator[tuple[_Item, bool]]:
         """Yield the items with far receipts as right: the recording has a long pause, or its clock was set."""
         yield from self._release_head()
-        yield from ((each, False) for each in self._far)
+        yield from ((each, False) for each, _ in self._far)
         self._far = []
         self._num_near += self._num_far
         self._num_far = 0
         self._newest_ns = self._far_newest_ns
 
     def _release_head(self) -> Iterator[tuple[_Item, bool]]:
-        yield from ((each, False) for each in self._head or ())
+        yield from ((each, False) for each, _ in self._head or ())
         self._head = None
 
 

@@ -78,6 +78,19 @@ def test_truth_has_no_receipt_that_counts(tmp_path):
     assert list(with_right_receipts(tmp_path, given)) == given
 
 
+@pytest.mark.parametrize("far_ns", [11 * 10**9, 2 * HOUR_NS])
+@pytest.mark.parametrize("number", [1, 4, 150])
+def test_truth_keeps_its_index_beside_a_receipt_that_is_far(far_ns, number):
+    zeros = [(0, "ego")] * number
+    given = [*zeros, (far_ns, "ego"), (None, "truth"), (far_ns, "ego"), (None, "truth")]
+    decided = list(sorted_out(given, lambda each: each[0]))
+    assert sorted(is_wrong for each, is_wrong in decided if each[1] == "truth") == [
+        False,
+        False,
+    ]
+    assert [each for each, _ in decided] == given
+
+
 def test_left_out_detections_are_counted_in_the_next_list_of_their_sensor(
     tmp_path, caplog
 ):
