@@ -31,6 +31,14 @@ SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
         "bounds.csv",
         0,
     ),
+    "calls": ({"estimators": "ekf-replay,smoother"}, {}, "calls.csv", 2),
+    "commits": (
+        {"other": EXPERIMENTS.parent, "estimators": "ekf-replay", "objects": "1"}
+        | {"rounds": 1, "duration_s": 2.0},
+        {},
+        "commits.csv",
+        1,
+    ),
     "doppler": (
         {"runs": 2},
         {"DURATION_S": 1.3, "NAMES": ("ekf-replay", "smoother-banded")},
