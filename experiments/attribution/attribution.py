@@ -59,6 +59,7 @@ CONTESTANTS: Mapping[str, Contestant] = {
     "forgets": Contestant("rewind-forget", options=_ONE_POINT),
     "EKF": Contestant("ekf-replay", options=_ONE_POINT),
     "EKF, initiated": Contestant("ekf-replay", options=_REGRESSION),
+    "EKF, initiated, smoothing pass": Contestant("ekf-rts", options=_REGRESSION),
     "EKF, initiated, robust": Contestant("ekf-replay", HUBER, _REGRESSION),
     "iterated EKF, initiated": Contestant("iekf-replay", options=_REGRESSION),
     "IPLF, initiated": Contestant("iplf-replay", options=_REGRESSION),
@@ -358,7 +359,8 @@ def table_of_steps(found: Scores) -> list[list[str]]:
         ]
         rows.append([step, *(marked(one) for one in of_worlds)])
     before, after = STEPS[SMOOTHING]
-    waiting, smoothing = [], []
+    single = "EKF, initiated", "EKF, initiated, smoothing pass"
+    waiting, smoothing, passing, graph = [], [], [], []
     for runs in found.values():
         waited = [run[before].waited_rmse_m for run in runs]
         waiting.append(
@@ -367,10 +369,17 @@ def table_of_steps(found: Scores) -> list[list[str]]:
         smoothing.append(
             marked(change([run[after].waited_rmse_m for run in runs], waited))
         )
+        filtered, passed = (
+            [run[name].waited_rmse_m for run in runs] for name in single
+        )
+        passing.append(marked(change(passed, filtered)))
+        graph.append(marked(change([run[after].waited_rmse_m for run in runs], passed)))
     return [
         *rows,
         [f"waiting {WAIT_S:g} s, filter", *waiting],
         [f"smoothing, {WAIT_S:g} s ago", *smoothing],
+        [f"smoothing pass over the EKF, {WAIT_S:g} s ago", *passing],
+        [f"smoother against that pass, {WAIT_S:g} s ago", *graph],
     ]
 
 

@@ -49,6 +49,7 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
             add("policy", row["estimator"], row["rms_m"])
         for row in tables["waiting"].records:
             add("filtered", f"{row['wait_s']:g}", row["filter_m"])
+            add("with a smoothing pass", f"{row['wait_s']:g}", row["rts_m"])
             add("smoothed", f"{row['wait_s']:g}", row["smoother_m"])
         for row in tables["sensors"].records:
             add("lateness costs", row["sensor"], row["cost"])

@@ -31,6 +31,8 @@ from fgtrack.runs import load_run
 SMOOTHER, PUBLISHED, FORGET = "smoother-banded", "ekf-backward-forward", "rewind-forget"
 POLICIES = ("drop", "as-current", PUBLISHED, FORGET, REPLAY, SMOOTHER)
 """Estimators that the ledger compares."""
+RTS = "ekf-rts"
+"""Estimator that adds a smoothing pass to the replaying EKF: the opponent of the smoother for states of the past."""
 WAITS_S = (0.0, 0.1, 0.3, 1.0)
 """Ages of the compared states: the benefit of waiting."""
 SUMMARY_S = 60.0
@@ -199,7 +201,9 @@ def _explained(
     tables = {
         "waterfall": _waterfall(replays, waterfall),
         "policies": _policies(replays, policies),
-        "waiting": _waiting(replays, policies),
+        "waiting": _waiting(
+            replays, policies, replays.squares(RTS, best, waits_s=WAITS_S)
+        ),
         "sensors": _sensors(replays, best, policies[REPLAY][0], common),
     }
     sentence = _sentence(waterfall, tables)
@@ -322,25 +326,35 @@ def _policies(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
     return Table(title, records, columns, ("estimator",), [_note(replays)])
 
 
-def _waiting(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
+def _waiting(
+    replays: PairedReplay, policies: Mapping[str, Squares], passes: Squares
+) -> Table:
+    """Return the table of the errors of past states: filtered, with a smoothing pass (`passes`), and smoothed."""
     filters = policies[REPLAY]
     smoothers = policies[SMOOTHER]
-    common: BoolArray = np.all(np.isfinite([*filters, *smoothers]), axis=0)
+    common: BoolArray = np.all(np.isfinite([*filters, *passes, *smoothers]), axis=0)
     records = [
         {
             "wait_s": wait_s,
             "filter_m": _rms(filtered, common),
+            "rts_m": _rms(passed, common),
             "smoother_m": _rms(smoothed, common),
         }
-        | _named("gain", _difference(filtered, smoothed, common))
-        for wait_s, filtered, smoothed in zip(WAITS_S, filters, smoothers, strict=True)
+        | _named("gain", _difference(filtered, passed, common))
+        | _named("graph_gain", _difference(passed, smoothed, common))
+        for wait_s, filtered, passed, smoothed in zip(
+            WAITS_S, filters, passes, smoothers, strict=True
+        )
         if common.any()
     ]
+    word = _word(replays)
     columns = [
         Column("state of [s] ago", "wait_s"),
-        Column(f"{_word(replays)}filtered\nRMSE [m]", "filter_m"),
-        Column(f"{_word(replays)}smoothed\nRMSE [m]", "smoother_m"),
-        _interval("smoothing gives\n[m] (95 %)", "gain"),
+        Column(f"{word}{REPLAY}\nRMSE [m]", "filter_m"),
+        Column(f"{word}{RTS}\nRMSE [m]", "rts_m"),
+        Column(f"{word}smoother\nRMSE [m]", "smoother_m"),
+        _interval("smoothing pass gives\n[m] (95 %)", "gain"),
+        _interval("factor graph adds\n[m] (95 %)", "graph_gain"),
     ]
     return Table("What waiting buys", records, columns, ("wait_s",), [_note(replays)])
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import repeat
 from types import TracebackType
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from fgtrack.core.checks import as_stamp
+from fgtrack.core.checks import as_stamp, is_number
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.time import nanoseconds, seconds
@@ -105,7 +106,7 @@ class changing_nothing:  # noqa: N801 - as `contextlib.suppress`
 class ObjectBank(Stateful, Generic[_E]):
     """A bank with one `Estimator` per object, which `start` makes.
 
-    An exception becomes an `EstimatorError`, except a `DataError`.
+    An exception becomes an `EstimatorError`, except a `DataError`. `lagged_s` are the lags of the lagged states.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -114,9 +115,14 @@ class ObjectBank(Stateful, Generic[_E]):
     )
 
     def __init__(
-        self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float
+        self,
+        motion: MotionModel,
+        start: Callable[[Start], _E],
+        lag_s: float,
+        lagged_s: Sequence[float] = (),
     ) -> None:
         self._motion = motion
+        self._lagged_s = lagged_s
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
         self._estimators: dict[int, _E] = {}
@@ -203,8 +209,8 @@ class ObjectBank(Stateful, Generic[_E]):
         )
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`: always empty."""
-        return []
+        """See `TrackBank.smoothed`: states of every lag, and no final states."""
+        return lagged_reports(self, self._motion, self._lagged_s)
 
     def _ask(
         self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None
@@ -232,6 +238,29 @@ class ObjectBank(Stateful, Generic[_E]):
                 f"a state has the shapes {state.mean.shape} and {state.covariance.shape}"
             )
         return state
+
+
+def checked_lags(lag_s: float, lagged_s: Sequence[float] | float) -> tuple[float, ...]:
+    """Return `lagged_s` as floats. Raises `ValueError` for a lag that is not between 0 and `lag_s`."""
+    lags = [lagged_s] if isinstance(lagged_s, int | float) else list(lagged_s)
+    if not all(is_number(each, 0.0) and each <= lag_s for each in lags):
+        raise ValueError(
+            f"lagged_s: must lie between 0 and the window of {lag_s:g} s, is {lagged_s}"
+        )
+    return tuple(map(float, lags))
+
+
+def lagged_reports(
+    bank: TrackBank, motion: MotionModel, lagged_s: Sequence[float]
+) -> list[SmoothedReport]:
+    """Return the states of all tracks of `bank` at each of `lagged_s` before the present."""
+    reports = list[SmoothedReport]()
+    for lag_s in lagged_s:
+        stamp_ns = bank.present_ns - nanoseconds(lag_s)
+        states = bank.states_at(stamp_ns)
+        lagged = kinematic_states(motion, stamp_ns, states.means, states.covariances)
+        reports += map(SmoothedReport, states.track_ids, lagged, repeat(lag_s))
+    return reports
 
 
 def _checked(result: UpdateResult, measurement: Measurement) -> UpdateResult:

@@ -28,6 +28,7 @@ ESTIMATORS = Registry(
         "fgtrack.estimators": {
             "ekf-backward-forward": "fgtrack.karle2023.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.filters.replay_bank:ekf_replay",
+            "ekf-rts": "fgtrack.estimation.filters.rts_replay:ekf_rts",
             "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
             "iplf-replay": "fgtrack.estimation.filters.ukf:IplfReplay",

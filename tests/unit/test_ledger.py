@@ -180,9 +180,15 @@ def test_a_late_sensor_costs_and_its_late_lists_are_worth_something(
 def test_waiting_buys_more_than_smoothing(karle: Ledger) -> None:
     now, *_, longest = karle.tables.tables["waiting"].records
     assert longest["smoother_m"] < longest["filter_m"] < now["filter_m"]
-    assert now["gain"] == pytest.approx(
-        0.0, abs=0.02
-    )  # at the newest stamp both nearly tie
+    assert now["gain"] == 0.0  # a smoothing pass changes the past alone
+
+
+def test_a_smoothing_pass_over_the_filter_does_what_the_smoother_does(
+    karle: Ledger,
+) -> None:
+    for row in karle.tables.tables["waiting"].records:
+        assert row["rts_m"] == pytest.approx(row["smoother_m"], rel=0.02)
+    assert row["rts_m"] < 0.9 * row["filter_m"]
 
 
 def test_without_truth_predicted_variances_stand_for_errors(

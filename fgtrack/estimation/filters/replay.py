@@ -50,7 +50,8 @@ class Step:
     """States by each model of `imm-replay`. `mean` and `covariance` are the moments of the mixture."""
 
 
-_stamp = attrgetter("stamp_ns")
+#: Sort key of steps.
+by_stamp = attrgetter("stamp_ns")
 
 
 class ReplayEkf(WindowedFilter):
@@ -82,7 +83,7 @@ class ReplayEkf(WindowedFilter):
         """See `Estimator.state_at`: the filtered state, given the measurements up to this stamp."""
         stamp_ns = asked_stamp(stamp_ns, self.steps[0].stamp_ns)
         before = self.steps[
-            max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)
+            max(bisect.bisect_right(self.steps, stamp_ns, key=by_stamp) - 1, 0)
         ]
         mean, covariance, _ = self._ahead(before, stamp_ns)
         return track_state(self._motion, stamp_ns, mean, covariance)
@@ -90,7 +91,7 @@ class ReplayEkf(WindowedFilter):
     def _forget_before(self, stamp_ns: int) -> None:
         # a measurement at this very stamp may still come, and needs a step before it
         del self.steps[
-            : max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)
+            : max(bisect.bisect_left(self.steps, stamp_ns, key=by_stamp) - 1, 0)
         ]
 
     def has_fused(self, measurement: Measurement) -> bool:
@@ -98,8 +99,8 @@ class ReplayEkf(WindowedFilter):
         stamp_ns = measurement.stamp_ns
         if stamp_ns < self._start_ns:
             return False
-        first = bisect.bisect_left(self.steps, stamp_ns, key=_stamp)
-        last = bisect.bisect_right(self.steps, stamp_ns, key=_stamp)
+        first = bisect.bisect_left(self.steps, stamp_ns, key=by_stamp)
+        last = bisect.bisect_right(self.steps, stamp_ns, key=by_stamp)
         fused = [step.measurement for step in self.steps[first:last]]
         return any(
             each is not None and each.order == measurement.order for each in fused
@@ -109,7 +110,7 @@ class ReplayEkf(WindowedFilter):
         stamp_ns = (
             measurement.stamp_ns
         )  # it comes by stamp and, at one stamp, by content; never before the first
-        index = max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp), 1)
+        index = max(bisect.bisect_right(self.steps, stamp_ns, key=by_stamp), 1)
         while index > 1 and self.steps[index - 1].stamp_ns == stamp_ns:
             last = self.steps[index - 1].measurement
             if last is None or last.content <= measurement.content:

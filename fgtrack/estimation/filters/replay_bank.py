@@ -49,6 +49,8 @@ from fgtrack.estimation.object_bank import (
     Outcomes,
     as_unchanged,
     changing_nothing,
+    checked_lags,
+    lagged_reports,
 )
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import MotionModel, WhiteNoise
@@ -72,6 +74,8 @@ class ReplayBank(Stateful):
         Length of the windows.
     initiation
         See `Initiation`.
+    lagged_s
+        Lags of the lagged states, each at most `lag_s`.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -86,9 +90,14 @@ class ReplayBank(Stateful):
     )
 
     def __init__(
-        self, motion: WhiteNoise, lag_s: float, initiation: str = DEFAULT
+        self,
+        motion: WhiteNoise,
+        lag_s: float,
+        initiation: str = DEFAULT,
+        lagged_s: Sequence[float] | float = (),
     ) -> None:
         self._motion, self._lag_ns = motion, nanoseconds(lag_s)
+        self._lagged_s = checked_lags(lag_s, lagged_s)
         self._initiation = checked_initiation(initiation)
         self._kind, self._noise = motion.kind, motion.noise
         self.present_ns = 0
@@ -244,8 +253,8 @@ class ReplayBank(Stateful):
         self._order = None
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`: always empty."""
-        return []
+        """See `TrackBank.smoothed`: filtered states of every lag, and no final states."""
+        return lagged_reports(self, self._motion, self._lagged_s)
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
         """True if the window has an identical measurement of this track."""
@@ -403,18 +412,25 @@ def _results(
 
 
 def ekf_replay(
-    motion: MotionModel, lag_s: float, initiation: str = DEFAULT
+    motion: MotionModel,
+    lag_s: float,
+    initiation: str = DEFAULT,
+    lagged_s: Sequence[float] | float = (),
 ) -> TrackBank:
     """Return the bank of EKFs with replay, whose estimates do not depend on the order of arrival.
 
     The filters keep the measurements of a window. They roll back and re-filter later measurements, as
     robot_localization does. A motion model of a plug-in is linearised outside the compiled loops, with a
-    `ReplayEkf` for each object. `initiation`: see `Initiation`.
+    `ReplayEkf` for each object. `initiation`: see `Initiation`. `lagged_s` are lags of additional outputs: filtered
+    states of the past, with everything that has arrived since.
     """
     if isinstance(motion, WhiteNoise) and motion.is_compiled:
-        return ReplayBank(motion, lag_s, initiation)
+        return ReplayBank(motion, lag_s, initiation, lagged_s)
     return ObjectBank(
-        motion, lambda start: ReplayEkf(motion, start, lag_s, initiation), lag_s
+        motion,
+        lambda start: ReplayEkf(motion, start, lag_s, initiation),
+        lag_s,
+        checked_lags(lag_s, lagged_s),
     )
 
 
