@@ -10,6 +10,8 @@ from fgtrack.cli.arguments import FormOption, Overwrite, Seed
 from fgtrack.cli.show import progress, say, sentences, show
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.output import check_output, new_files
+from fgtrack.ranking.crowd_files import write_crowd, write_crowd_truth
+from fgtrack.ranking.crowds import CROWDS
 from fgtrack.ranking.files import write_exact, write_problem
 from fgtrack.ranking.judge import judge
 from fgtrack.ranking.public import method
@@ -27,7 +29,11 @@ def rank(
     ] = None,
     scenarios: Annotated[
         list[str] | None,
-        Option("--scenario", help=f"Scenario; repeatable. {', '.join(SCENARIOS)}."),
+        Option(
+            "--scenario",
+            help=f"Scenario; repeatable. One object (default): {', '.join(SCENARIOS)}. "
+            f"Several objects: {', '.join(CROWDS)}.",
+        ),
     ] = None,
     runs: Annotated[int, Option(min=2, help="Number of runs of each scenario.")] = 10,
     seed: Seed = 1,
@@ -42,10 +48,11 @@ def rank(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Rank methods for late measurements of one object.
+    """Rank methods for late measurements of one object or of several objects.
 
     Each method answers the same questions: where is the object now, and where was it?
-    The answers are compared with the truth and with the exact joint estimate.
+    The answers are compared with the truth and with the exact joint estimate, the tracks
+    of several objects with the truth.
     """
     names = list(dict.fromkeys(scenarios or SCENARIOS))
     if not methods and export is None:
@@ -101,6 +108,11 @@ def _outputs(out: Path | None, names: list[str]) -> list[Path]:
 def _export(folder: Path, name: str, seed: int, overwrite: bool) -> None:
     """Write measurements, truth and exact states of the scenario `name` into a folder."""
     with new_files(folder, overwrite) as into:
+        if name in CROWDS:
+            crowd = CROWDS[name].draw(name, seed)
+            write_crowd(into, crowd)
+            write_crowd_truth(into, crowd)
+            return
         problem = draw(name, seed)
         write_problem(into, problem)
         write_exact(into, problem)

@@ -43,8 +43,8 @@ def write_problem(folder: Path, problem: Problem) -> Path:
         rows.append(
             {
                 "kind": "query",
-                "receipt_s": _decimal(receipt_ns - start_ns),
-                "stamp_s": _decimal(query.stamp_ns - start_ns),
+                "receipt_s": decimal(receipt_ns - start_ns),
+                "stamp_s": decimal(query.stamp_ns - start_ns),
             }
         )
     path = folder / MEASUREMENTS
@@ -83,15 +83,15 @@ def _row(problem: Problem, number: int) -> Mapping[str, object]:
     start_ns = problem.start.stamp_ns
     return {
         "kind": "measurement",
-        "receipt_s": _decimal(each.receipt_ns - start_ns),
-        "stamp_s": _decimal(each.measurement.stamp_ns - start_ns),
+        "receipt_s": decimal(each.receipt_ns - start_ns),
+        "stamp_s": decimal(each.measurement.stamp_ns - start_ns),
         "sensor": each.sensor,
         **dict(zip(names, each.measurement.z.tolist(), strict=True)),
         **{f"std_{name}": std for name, std in zip(names, stds, strict=True)},
     }
 
 
-def _decimal(duration_ns: int) -> str:
+def decimal(duration_ns: int) -> str:
     """Return a duration in s with all its nanoseconds."""
     sign = "-" if duration_ns < 0 else ""
     whole, rest = divmod(abs(duration_ns), NS_PER_S)
@@ -116,17 +116,18 @@ def read_states(path: Path, count: int) -> list[Answer | None]:
 def _answer(row: Mapping[str, str], line: int) -> Answer | None:
     if not row[STATE[0]]:
         return None
-    mean = np.array([_number(row[name], name, line) for name in STATE])
+    mean = np.array([finite_number(row[name], name, line) for name in STATE])
     if not row.get(UPPER[0]):
         return Answer(mean, None)
-    upper = np.array([_number(row[name], name, line) for name in UPPER])
+    upper = np.array([finite_number(row[name], name, line) for name in UPPER])
     covariance: FloatArray = np.zeros((4, 4))
     covariance[np.triu_indices(4)] = upper
     covariance = covariance + np.triu(covariance, 1).T
     return Answer(mean, covariance)
 
 
-def _number(text: str, name: str, line: int) -> float:
+def finite_number(text: str, name: str, line: int) -> float:
+    """Return the number in a cell of column `name`. Raises `ValueError` if it is no finite number."""
     try:
         value = float(text)
     except (TypeError, ValueError):

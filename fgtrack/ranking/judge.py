@@ -8,11 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgtrack.ranking.crowd_result import CrowdResult
+from fgtrack.ranking.crowds import CROWDS, CrowdProblem
 from fgtrack.ranking.methods import Answers, Method, MethodError
 from fgtrack.ranking.problem import LAGS_S, Answer, Problem
 from fgtrack.ranking.result import Ranking, Result
 from fgtrack.ranking.scenarios import draw
 
+_NOT_CAUSAL = "its answers change where later rows are missing, or from run to run"
 _PERMUTED = 2
 """Number of runs of a scenario whose arrivals are also given in another order."""
 
@@ -31,13 +34,41 @@ def judge(
 
     Raises `CallError` for an unknown scenario.
     """
-    results = []
+    results: list[Result | CrowdResult] = []
     for scenario in scenarios:
-        problems = [draw(scenario, seed + number) for number in range(num_runs)]
+        seeds = range(seed, seed + num_runs)
+        if scenario in CROWDS:
+            crowds = [CROWDS[scenario].draw(scenario, number) for number in seeds]
+        else:
+            problems = [draw(scenario, number) for number in seeds]
         for each in methods:
             on_step(f"{scenario}, {each.name}")
-            results.append(_judged(each, scenario, problems))
+            if scenario in CROWDS:
+                results.append(_judged_tracks(each, scenario, crowds))
+            else:
+                results.append(_judged(each, scenario, problems))
     return Ranking(tuple(results), num_runs)
+
+
+def _judged_tracks(
+    method: Method, scenario: str, problems: Sequence[CrowdProblem]
+) -> CrowdResult:
+    try:
+        found = [method.tracks(problem) for problem in problems]
+        if not method.is_causal_for_tracks(problems[0], found[0]):
+            raise MethodError(_NOT_CAUSAL)
+    except MethodError as error:
+        return CrowdResult.without_tracks(method.name, scenario, str(error))
+    except NotImplementedError as error:
+        return CrowdResult.without_tracks(method.name, scenario, str(error), False)
+    pairs = zip(problems, found, strict=True)
+    return CrowdResult.of(
+        method.name,
+        scenario,
+        problems,
+        [each.positions for each in found],
+        float(np.median([own.seconds / len(one.scans) for one, own in pairs])),
+    )
 
 
 def permuted(problem: Problem, rng: np.random.Generator) -> Problem:
@@ -57,9 +88,7 @@ def _judged(method: Method, scenario: str, problems: Sequence[Problem]) -> Resul
     try:
         found = [method.answers(problem) for problem in problems]
         if not method.is_causal(problems[0], found[0]):
-            raise MethodError(
-                "its answers change where later rows are missing, or from run to run"
-            )
+            raise MethodError(_NOT_CAUSAL)
         order = _order(method, problems, found)
         peak_bytes = _peak_bytes(method, problems[0])
     except MethodError as error:

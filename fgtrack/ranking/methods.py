@@ -1,27 +1,39 @@
 """Methods that are ranked: the interface, estimators of fgtrack, and programs in any language."""
 
 import csv
+import math
 import subprocess
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from fgtrack.config.settings import Config
 from fgtrack.core.errors import CallError, FgtrackError, one_line
+from fgtrack.core.geometry import rotation
+from fgtrack.core.types import Detection, DetectionList, Frame, TrackStatus
 from fgtrack.estimation.registry import estimator
+from fgtrack.pipeline.live import Tracker
+from fgtrack.ranking.crowd_files import read_tracks, write_crowd
+from fgtrack.ranking.crowds import CrowdProblem, Positions, Scan
 from fgtrack.ranking.files import read_states, write_problem
 from fgtrack.ranking.problem import Answer, Problem, answer_of, cut_after
 
 WINDOW_S = 10.0
 """Window of the shipped estimators; it is longer than a scenario."""
 _TIMEOUT_S = 600.0
+_SPARE_S = 1.5
+"""Window of the shipped trackers beyond the longest delay; it reaches the oldest query."""
 _SAME = 1e-6
 """Largest difference of two answers that count as equal, in standard deviations or m."""
+
+T = TypeVar("T")
 
 
 class MethodError(FgtrackError):
@@ -40,6 +52,16 @@ class Answers:
     """Number of measurements that were not fused, by reason; programs do not report it."""
 
 
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks of a method at the queries of a problem with several objects."""
+
+    positions: tuple[Positions, ...]
+    """Positions of the tracks by id for each query."""
+    seconds: float
+    """Processor time, for a program the time on the clock."""
+
+
 class Method(ABC):
     """A method with a name."""
 
@@ -54,6 +76,16 @@ class Method(ABC):
         Raises `MethodError` if the method fails, and `NotImplementedError` if it is not
         made for the scenario.
         """
+
+    def tracks(self, problem: CrowdProblem) -> Tracks:
+        """Answer all queries of a problem with several objects. Raises as `answers`."""
+        raise NotImplementedError("it takes one object")
+
+    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
+        """True if the tracks of a query in the middle do not change where later scans are missing."""
+        middle = problem.queries[len(problem.queries) // 2].num_known
+        alone = self.tracks(problem.cut_after(middle)).positions
+        return all(map(_are_same_tracks, alone, found.positions))
 
     def is_causal(self, problem: Problem, found: Answers) -> bool:
         """True if answers do not change where all later arrivals are missing.
@@ -76,8 +108,14 @@ def _are_same(a: Answer | None, b: Answer | None) -> bool:
     return bool(np.allclose(a.mean, b.mean, rtol=0.0, atol=_SAME))
 
 
+def _are_same_tracks(a: Positions, b: Positions) -> bool:
+    return a.keys() == b.keys() and all(
+        np.allclose(a[track_id], b[track_id], rtol=0.0, atol=_SAME) for track_id in a
+    )
+
+
 class Shipped(Method):
-    """An estimator of fgtrack, or of a plug-in."""
+    """An estimator of fgtrack, or of a plug-in; for several objects the tracker with this estimator."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -107,6 +145,76 @@ class Shipped(Method):
                 found.append(answer_of(problem.motion, state))
         return Answers(tuple(found), time.process_time() - started_s, refused)
 
+    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
+        """True: the tracker gets the scans one by one."""
+        return True
+
+    def tracks(self, problem: CrowdProblem) -> Tracks:
+        """Answer all queries with the confirmed tracks."""
+        started_s = time.process_time()
+        tracker = Tracker(_configuration(self.name, problem))
+        ego = deque(problem.ego)
+        found = []
+        known = 0
+        for query in problem.queries:
+            for scan in problem.scans[known : query.num_known]:
+                while ego and ego[0].receipt_ns <= scan.receipt_ns:
+                    tracker.receive(ego.popleft())
+                tracker.receive(_list(problem, scan))
+                tracker.tick(scan.receipt_ns)
+            known = query.num_known
+            found.append(
+                {
+                    each.track_id: each.state.mean[:2]
+                    for each in tracker.tracks_at(query.stamp_ns)
+                    if each.status == TrackStatus.CONFIRMED
+                }
+            )
+        return Tracks(tuple(found), time.process_time() - started_s)
+
+
+def _list(problem: CrowdProblem, scan: Scan) -> DetectionList:
+    """Return a scan as a list, relative to the vehicle if there is one."""
+    points_m = scan.points_m
+    frame: Frame = "map"
+    if problem.ego:
+        points_m = (points_m - scan.pose[:2]) @ rotation(scan.pose[2])
+        frame = "ego"
+    objects = [Detection(x_m=x, y_m=y) for x, y in points_m.tolist()]
+    return DetectionList(scan.sensor, scan.stamp_ns, scan.receipt_ns, objects, frame)
+
+
+def _configuration(estimator_name: str, problem: CrowdProblem) -> Config:
+    """Return the model of a problem as a configuration of the tracker."""
+    longest_s = problem.max_delay_s + _SPARE_S
+    return Config.from_dict(
+        {
+            "estimator": estimator_name,
+            "sensors": {
+                name: {
+                    "std": {"x_m": sensor.std_m, "y_m": sensor.std_m},
+                    "detection_probability": sensor.detection_probability,
+                    "clutter_per_m2": sensor.clutter_per_m2,
+                    "field_of_view_rad": sensor.field_of_view_rad,
+                    "max_range_m": sensor.max_range_m,
+                    "max_range_behind_m": sensor.max_range_behind_m,
+                    "max_delay_s": longest_s,
+                }
+                for name, sensor in problem.sensors.items()
+            },
+            "clock": {"node_hz": None},
+            "motion": {
+                "kind": "cv",
+                "std_per_s": {
+                    "velocity": math.sqrt(100.0 * problem.acceleration_density_m2ps3)
+                },
+            },
+            "birth": {"speed_std_mps": problem.speed_mps * math.sqrt(2.0)},
+            "filter": {"storage_s": longest_s},
+            "smoother": {"lag_s": longest_s},
+        }
+    )
+
 
 class Program(Method):
     """A program that is called as `PROGRAM measurements.csv states.csv`."""
@@ -119,8 +227,33 @@ class Program(Method):
 
     def answers(self, problem: Problem) -> Answers:
         """Answer all queries. Raises `MethodError` if the program fails or its file cannot be read."""
+        count = len(problem.queries)
+        found, seconds = self._called(
+            problem.scenario,
+            lambda folder: write_problem(folder, problem),
+            lambda states: tuple(read_states(states, count)),
+        )
+        return Answers(found, seconds)
+
+    def tracks(self, problem: CrowdProblem) -> Tracks:
+        """Answer all queries of a problem with several objects. Raises as `answers`."""
+        count = len(problem.queries)
+        found, seconds = self._called(
+            problem.scenario,
+            lambda folder: write_crowd(folder, problem),
+            lambda states: read_tracks(states, count),
+        )
+        return Tracks(found, seconds)
+
+    def _called(
+        self,
+        scenario: str,
+        write: Callable[[Path], Path],
+        read: Callable[[Path], T],
+    ) -> tuple[T, float]:
+        """Return the content of the program's file, and the time of the call in s."""
         with tempfile.TemporaryDirectory() as folder:
-            measurements = write_problem(Path(folder), problem)
+            measurements = write(Path(folder))
             states = Path(folder) / "states.csv"
             started_s = time.perf_counter()
             try:
@@ -137,12 +270,11 @@ class Program(Method):
             if done.returncode:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]
                 raise MethodError(
-                    f"{self.name}: {problem.scenario}: exit code {done.returncode}: {one_line(last)}"
+                    f"{self.name}: {scenario}: exit code {done.returncode}: {one_line(last)}"
                 )
             try:
-                found = read_states(states, len(problem.queries))
+                return read(states), seconds
             except (OSError, ValueError, KeyError, csv.Error) as error:
                 raise MethodError(
-                    f"{self.name}: {problem.scenario}: states.csv: {one_line(str(error))}"
+                    f"{self.name}: {scenario}: states.csv: {one_line(str(error))}"
                 ) from error
-            return Answers(tuple(found), seconds)

@@ -16,7 +16,8 @@ from fgtrack.core.errors import CallError, one_line
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import MotionModel
-from fgtrack.ranking.methods import Answers, Method, MethodError
+from fgtrack.ranking.crowds import CrowdProblem, CrowdSensor
+from fgtrack.ranking.methods import Answers, Method, MethodError, Tracks
 from fgtrack.ranking.problem import Answer, Problem
 
 
@@ -63,8 +64,35 @@ class Given:
         return F, self.model.process_noise(self.mean, abs(dt_s))
 
 
+@dataclass(frozen=True)
+class ScanInPython:
+    """Scan of several objects for a method in a Python file; times are in s after the start of the problem."""
+
+    stamp_s: float
+    receipt_s: float
+    sensor: str
+    points_m: FloatArray
+    """Measured positions in the map, shape (n, 2)."""
+    pose: FloatArray
+    """Position x, y and yaw of the vehicle with the sensor, shape (3,); 0 if the sensor is at rest."""
+
+
+@dataclass(frozen=True)
+class GivenCrowd:
+    """Description of a problem with several objects for a method in a Python file."""
+
+    speed_mps: float
+    """Standard deviation of a component of the velocity of an object that appears."""
+    acceleration_density_m2ps3: float
+    """Density of the white noise of the acceleration."""
+    max_delay_s: float
+    """Longest delay of a scan."""
+    sensors: Mapping[str, CrowdSensor]
+    """Standard deviation, detection probability, clutter and field of view by name of the sensor."""
+
+
 class PythonMethod(Method):
-    """A class with `update` and `state_at`, or a function `fuse`."""
+    """A class with `update` and `state_at` or `tracks_at`, or a function `fuse`."""
 
     def __init__(self, name: str, code: Callable[..., Any]) -> None:
         self.name = name
@@ -82,6 +110,8 @@ class PythonMethod(Method):
         """Answer all queries. Raises `MethodError` if the code raises, see `Method.answers`."""
         started_s = time.process_time()
         refused: Counter[str] = Counter()
+        if self._is_class and not hasattr(self._code, "state_at"):
+            raise NotImplementedError("it has no state_at")
         try:
             raw = (
                 self._one_by_one(problem, refused)
@@ -103,6 +133,57 @@ class PythonMethod(Method):
             time.process_time() - started_s,
             refused,
         )
+
+    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
+        """True: a class gets the scans one by one."""
+        return True
+
+    def tracks(self, problem: CrowdProblem) -> Tracks:
+        """Answer all queries with the tracks of a class with `tracks_at`. Raises as `answers`."""
+        if not hasattr(self._code, "tracks_at"):
+            raise NotImplementedError("it has no tracks_at")
+        started_s = time.process_time()
+        try:
+            found = self._scan_by_scan(problem)
+        except NotImplementedError:
+            raise
+        except Exception as error:
+            raise MethodError(
+                f"{self.name}: {problem.scenario}: {type(error).__name__}: {one_line(str(error))}"
+            ) from error
+        return Tracks(tuple(found), time.process_time() - started_s)
+
+    def _scan_by_scan(self, problem: CrowdProblem) -> list[dict[int, FloatArray]]:
+        one = self._code(
+            GivenCrowd(
+                problem.speed_mps,
+                problem.acceleration_density_m2ps3,
+                problem.max_delay_s,
+                problem.sensors,
+            )
+        )
+        found = []
+        known = 0
+        for query in problem.queries:
+            for scan in problem.scans[known : query.num_known]:
+                one.update(
+                    ScanInPython(
+                        (scan.stamp_ns - problem.start_ns) / NS_PER_S,
+                        (scan.receipt_ns - problem.start_ns) / NS_PER_S,
+                        scan.sensor,
+                        scan.points_m,
+                        scan.pose,
+                    )
+                )
+            known = query.num_known
+            tracks = one.tracks_at((query.stamp_ns - problem.start_ns) / NS_PER_S)
+            found.append(
+                {
+                    int(track_id): _position(self.name, state)
+                    for track_id, state in dict(tracks).items()
+                }
+            )
+        return found
 
     def _one_by_one(self, problem: Problem, refused: Counter[str]) -> list[Any]:
         one = self._code(_given(problem))
@@ -146,7 +227,7 @@ def python_file(path: Path, wanted: str = "") -> PythonMethod:
         return PythonMethod(wanted, own[wanted])
     if not own:
         raise CallError(
-            f"{path}: define a class with update(observation) and state_at(time_s), "
+            f"{path}: define a class with update(observation) and state_at(time_s) or tracks_at(time_s), "
             "or a function fuse(given, observations, queries)"
         )
     if len(own) > 1:
@@ -158,8 +239,18 @@ def python_file(path: Path, wanted: str = "") -> PythonMethod:
 
 def _is_method(name: str, code: object) -> bool:
     if isinstance(code, type):
-        return hasattr(code, "update") and hasattr(code, "state_at")
+        return hasattr(code, "update") and (
+            hasattr(code, "state_at") or hasattr(code, "tracks_at")
+        )
     return name == "fuse" and callable(code)
+
+
+def _position(name: str, state: Any) -> FloatArray:
+    """Return the position of a track: its state begins with x and y."""
+    position_m = np.asarray(state, dtype=np.float64)[:2]
+    if position_m.shape != (2,) or not np.isfinite(position_m).all():
+        raise MethodError(f"{name}: a track must be finite x, y ..., not {state!r}")
+    return position_m
 
 
 def _given(problem: Problem) -> Given:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.intervals import Estimate, average, paired
+from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.tables import Column, Table, Tables
+from fgtrack.ranking.crowd_result import CrowdResult, crowd_table
 from fgtrack.ranking.problem import LAGS_S
+from fgtrack.ranking.ranks import interval, ranked
 from fgtrack.ranking.scenarios import SCENARIOS
 
 EXACT = 1e-6
@@ -62,6 +64,11 @@ class Result:
             problem=problem,
             takes_part=takes_part,
         )
+
+    @property
+    def error(self) -> FloatArray:
+        """Present error by run, which ranks the methods."""
+        return self.rmse_m[:, 0]
 
     @property
     def deviation(self) -> float:
@@ -118,7 +125,7 @@ def _departure(lag_s: float, deviation: float) -> str:
 class Ranking:
     """Results of all methods in all scenarios."""
 
-    results: tuple[Result, ...]
+    results: tuple[Result | CrowdResult, ...]
     num_runs: int
 
     @property
@@ -135,8 +142,12 @@ class Ranking:
         return [each.sentence for each in self.results if each.method == method]
 
     def _table(self, scenario: str) -> Table:
-        results = [each for each in self.results if each.scenario == scenario]
-        records = [{**_record(each), "rank": rank} for each, rank in _ranked(results)]
+        own = [each for each in self.results if each.scenario == scenario]
+        crowds = [each for each in own if isinstance(each, CrowdResult)]
+        if crowds:
+            return crowd_table(scenario, crowds, self.num_runs)
+        results = [each for each in own if isinstance(each, Result)]
+        records = [{**_record(each), "rank": rank} for each, rank in ranked(results)]
         notes = [
             f"{SCENARIOS[scenario].about}; {self.num_runs} runs; brackets: 95 % intervals over the runs",
             "rank: methods whose error now does not differ significantly from the best one of the rank share it",
@@ -173,28 +184,14 @@ _COLUMNS = (
 )
 
 
-def _ranked(results: Sequence[Result]) -> list[tuple[Result, int | None]]:
-    """Return the results with their ranks, the best first; a method without answers has no rank."""
-    known = [each for each in results if len(each.rmse_m)]
-    known.sort(key=lambda each: (_mean(each.rmse_m[:, 0].tolist()), each.method))
-    ranked: list[tuple[Result, int | None]] = []
-    first: Result | None = None
-    rank = 0
-    for number, each in enumerate(known, start=1):
-        if first is None or paired(each.rmse_m[:, 0], first.rmse_m[:, 0]).low > 0.0:
-            first, rank = each, number
-        ranked.append((each, rank))
-    return [*ranked, *((each, None) for each in results if not len(each.rmse_m))]
-
-
 def _record(result: Result) -> dict[str, object]:
     if result.problem is not None:
         return {"method": result.method, "problem": result.problem}
     now, anees = average(result.rmse_m[:, 0]), average(result.nees)
     record: dict[str, object] = {
         "method": result.method,
-        **_interval("error", now, "_m"),
-        **_interval("anees", anees, ""),
+        **interval("error", now, "_m"),
+        **interval("anees", anees, ""),
         "order": result.order,
         "refused": sum(result.refused.values()),
         "seconds": result.seconds,
@@ -204,14 +201,6 @@ def _record(result: Result) -> dict[str, object]:
         record[f"error_{k}_m"] = _mean(result.rmse_m[:, k].tolist())
         record[f"deviation_{k}"] = float(result.deviations[:, k].max())
     return record
-
-
-def _interval(name: str, estimate: Estimate, unit: str) -> dict[str, float]:
-    return {
-        f"{name}{unit}": estimate.mean,
-        f"{name}_low{unit}": estimate.low,
-        f"{name}_high{unit}": estimate.high,
-    }
 
 
 def _scientific(value: str | int | float) -> str:

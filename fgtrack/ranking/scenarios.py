@@ -12,6 +12,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import AT_ORIGIN, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.ranking.crowds import CROWDS
 from fgtrack.ranking.problem import Arrival, Problem, answer_of, queries_of
 from fgtrack.sim.vehicles import draw_states
 
@@ -223,14 +224,15 @@ SCENARIOS: Mapping[str, Scenario] = {
     ),
     "ctrv": Scenario("positions, constant turn rate and velocity", _LATE, CTRV()),
 }
-"""Shipped scenarios by name."""
+"""Shipped scenarios of one object by name."""
+NAMES = (*SCENARIOS, *CROWDS)
+"""Names of all scenarios, those of several objects at the end."""
 
 
 def draw(name: str, seed: int) -> Problem:
     """Draw the scenario `name` with a seed. Raises `CallError` for an unknown name."""
     if name not in SCENARIOS:
         raise CallError(
-            f"scenario {name!r} is unknown{did_you_mean(name, SCENARIOS)}: "
-            f"there are {', '.join(SCENARIOS)}"
+            f"scenario {name!r} is unknown{did_you_mean(name, NAMES)}: there are {', '.join(NAMES)}"
         )
     return SCENARIOS[name].draw(name, np.random.default_rng(seed))

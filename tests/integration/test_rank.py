@@ -189,6 +189,10 @@ def test_a_method_that_is_not_made_for_a_scenario_takes_no_part() -> None:
         def __init__(self, given: Any) -> None:
             self.transition = given.transition(0.1)
 
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> None: ...
+
     result = rank(Positions, "ctrv")
     assert not result.takes_part
     assert "takes no part: no linear transition for ctrv" in result.sentence
