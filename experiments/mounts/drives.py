@@ -87,8 +87,10 @@ def drive(
     sensors: Sequence[Sensor] = NEWCOMER,
     parked: int = 2,
     turning: float = 1.0,
+    along: int = 4,
+    oncoming: int = 4,
 ) -> Drive:
-    """Simulate a drive of a minute with eight moving cars and `parked` cars at the roadside."""
+    """Simulate a drive of a minute with cars `along` the ego, `oncoming` cars, and `parked` cars at the roadside."""
     rng = np.random.default_rng(seed)
     times_s = np.arange(-5.0, DURATION_S + 5.0, STEP_S)
     speed = 13.0 + _smooth(rng, times_s, 1.5)
@@ -107,9 +109,9 @@ def drive(
         return np.column_stack([x_m, y_m])
 
     paths = []
-    for k in range(8):
+    for k in range(along + oncoming):
         lane_m = np.full(len(times_s), rng.choice([0.0, 3.5, 3.5, 7.0]))
-        if k < 4:  # the ego's direction, near the ego
+        if k < along:  # the ego's direction, near the ego
             gap_m = rng.choice([-1.0, 1.0]) * rng.uniform(12.0, 45.0)
             gap_m = gap_m + rng.uniform(-1.0, 1.0) * times_s
             s_m = arc_m + gap_m + _smooth(rng, times_s, 2.0)

@@ -355,7 +355,7 @@ class Adviser:
             )
             key = f"sensors.{item.sensor}.mount"
             text = f"its mount differs from the configured one. Estimated {source}: {item.words}."
-            settings = {key: plain_mount(item.significant_pose)}
+            settings = {key: plain_mount(item.pose)}
             if frames.get(item.sensor) != "sensor":
                 text += f" Set `frame: sensor` in its input, and {key} to this mount."
                 settings = {}

@@ -13,7 +13,7 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray, IntArray
 
-__all__ = ["Information", "jackknife"]
+__all__ = ["Information", "dof_of_sum", "jackknife"]
 
 #: Share of the information that the data must carry.
 _CARRIED = 0.5
@@ -59,3 +59,17 @@ def jackknife(
     carried = sums / np.maximum(np.einsum("ij,ji->i", functions, columns), 1e-300)
     known &= carried > _CARRIED
     return np.where(known, std, np.inf), np.where(known, dof, 0.0)
+
+
+def dof_of_sum(
+    one: FloatArray, one_dof: FloatArray, other: FloatArray, other_dof: float
+) -> FloatArray:
+    """Return the degrees of freedom of the sum of two estimated variances, shape (n,) (Welch and Satterthwaite).
+
+    They stay `one_dof` where the variance `one` is infinite or 0.
+    """
+    known = np.isfinite(one) & (one > 0.0) & (one_dof > 0.0)
+    one = np.where(known, one, 1.0)
+    parts = np.square(one) / np.where(known, one_dof, 1.0)
+    parts += np.square(other) / other_dof
+    return np.where(known, np.square(one + other) / parts, one_dof)

@@ -242,9 +242,11 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     - the header frame is unknown, and no test shows the yaw of the sensor;
     - the sensor measures ranges and bearings beside other sensors, and nothing shows its mount;
     - positions of sensors are in different frames, and nothing shows which frame is the ego's;
-    - an object stands still at another yaw than the assumed one.
+    - the traffic past the ego is more probable for another yaw than the assumed one.
 
-    A single sensor, or sensors that agree, may be assumed in the ego.
+    Positions of a single sensor, or of sensors that agree, may be assumed in the ego's
+    frame. A sensor that measures ranges and bearings may be assumed ahead if the ego
+    does not move past objects.
     """
     paths = {
         name: path
@@ -314,8 +316,8 @@ def _doubt(
     """
     reference = mounts.references.get(members[0], members[0])
     root = mounts[reference]
-    if root.contrary_yaw_rad is not None:
-        return f"{reference}: {root.why}; too few objects confirm it"
+    if root.traffic == "contradicts":
+        return f"{reference}: {root.why}"
     if root.is_off:
         return f"the yaw of {reference} is known too roughly: {root.words}"
     others = [name for name in members if name != reference]
@@ -333,9 +335,11 @@ def _doubt(
         return f"nothing shows the mount of {reference}: {against}"
     elif len(members) < len(mounts.sensors):
         return (
-            f"nothing shows it: {mounts[reference].why}, and too few of its detections "
+            f"nothing shows it: {root.why}, and too few of its detections "
             "are common with other sensors"
         )
+    elif root.traffic == "undecided":
+        return f"nothing shows it: {root.why}"
     return None
 
 
@@ -417,14 +421,17 @@ def _mount_decision(
     if item.is_off and is_placed:
         frame = "optical" if _mapping_frame(sample, name) == "optical" else "sensor"
         settings = {
-            ("sensors", name, "mount"): plain_mount(item.significant_pose),
+            ("sensors", name, "mount"): plain_mount(item.pose),
             (*path, "frame"): frame,
         }
-        question = (
-            None
-            if item.is_known
-            else f"components without an interval are assumed; {_question(sample, name)}"
-        )
+        question = None
+        if not item.is_known:
+            question = (
+                f"components without an interval are assumed; {_question(sample, name)}"
+            )
+        elif item.rough_components:
+            rough = " and ".join(item.rough_components)
+            question = f"{rough} known roughly; {_question(sample, name)}"
         yield Decision(
             name, "mount", settings, "tested", f"{against}{item.words}", question
         )

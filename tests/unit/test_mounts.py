@@ -10,7 +10,9 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
 from fgtrack.meaning.frames import frame_of, is_optical
 from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
-from fgtrack.meaning.tracklets import points_of, tracklets
+from fgtrack.meaning.mounts.table import Table
+from fgtrack.meaning.mounts.traffic import TrafficYaw, traffic_yaw
+from fgtrack.meaning.tracklets import EgoMotion, points_of, tracklets
 from tests.support.scripts import load
 
 DRIVES = load("mounts", "drives")
@@ -75,9 +77,53 @@ def test_still_objects_show_the_yaw_of_a_lone_sensor() -> None:
     assert mounts["radar"].is_sure_of_yaw
 
 
-def test_nothing_shows_the_mount_of_a_lone_sensor_without_still_objects() -> None:
+@pytest.mark.parametrize("yaw_rad", [0.25, 1.3, math.pi])
+def test_moving_cars_show_the_yaw_of_a_lone_sensor(yaw_rad: float) -> None:
+    lone = (Sensor("radar", yaw_rad, half_view_rad=1.3),)
+    mounts = estimate(DRIVES.drive(4, lone, parked=0).messages)
+    assert abs(wrap_angle(mounts["radar"].yaw_rad - yaw_rad)) < 0.02
+    assert mounts["radar"].is_sure_of_yaw
+    assert mounts["radar"].is_off
+    assert not mounts["radar"].is_known
+
+
+def test_a_car_that_crosses_does_not_show_the_yaw() -> None:
+    yaw = crossing_traffic_yaw(cars=1)
+    assert yaw.probability < 0.9
+
+
+def crossing_traffic_yaw(cars: int) -> TrafficYaw:
+    """Return the yaw by `cars` that cross the path of an ego on a straight road."""
+    motion = EgoMotion(np.array([[t, 10.0 * t, 0.0, 0.0] for t in range(30)]))
+    times_s = np.arange(10.0, 16.0, 0.1)
+    rows = []
+    for number in range(cars):
+        at_m = np.column_stack([np.full(60, 190.0 + number), 9.0 * (times_s - 12.0)])
+        rows.append(at_m - motion.poses(times_s)[:, :2])
+    size = 60 * cars
+    numbers = np.repeat(np.arange(cars), 60)
+    stamps_s = np.tile(times_s, cars)
+    table = Table(
+        np.zeros(size, dtype=np.int64),
+        numbers,
+        np.zeros(size, dtype=np.int64),
+        numbers,
+        stamps_s,
+        np.concatenate(rows),
+        np.concatenate(rows),
+        motion.poses(stamps_s),
+        np.full((size, 2, 2), 0.1),
+        np.zeros(size, dtype=bool),
+    )
+    yaw = traffic_yaw(table, [Pose2()], motion)
+    assert yaw is not None
+    return yaw
+
+
+def test_nothing_shows_the_mount_of_a_lone_sensor_in_a_convoy() -> None:
     lone = (Sensor("radar", 0.7),)
-    mounts = estimate(DRIVES.drive(4, lone, parked=0, turning=0.0).messages)
+    convoy = {"parked": 0, "turning": 0.0, "along": 2, "oncoming": 0}
+    mounts = estimate(DRIVES.drive(4, lone, **convoy).messages)
     assert mounts["radar"].pose == Pose2()
     assert math.isinf(mounts["radar"].half_widths[0])
     assert "assumed" in str(mounts["radar"])

@@ -16,7 +16,7 @@ from tests.support.scripts import load
 
 DRIVES = load("mounts", "drives")
 Sensor = DRIVES.Sensor
-MOVING = {"parked": 0, "turning": 0.0}
+CONVOY = {"parked": 0, "turning": 0.0, "along": 2, "oncoming": 0}
 """A drive that does not show the mount of the reference."""
 
 
@@ -50,22 +50,29 @@ REAR = Sensor("rear", math.pi, -1.0, half_view_rad=0.9)
 
 
 def test_a_radar_without_common_objects_is_asked_for_beside_another_sensor() -> None:
-    found = decisions(1, FRONT, REAR, **MOVING)
+    found = decisions(1, FRONT, REAR, **CONVOY)
     assert found["rear"].certainty == "open"
     assert "sensors.rear.mount" in str(found["rear"].question)
     assert found["front"].certainty == "assumed"
     assert "input.csv.detections.front.frame" in str(found["front"].question)
 
 
-def test_a_lone_radar_may_be_assumed_in_the_ego_frame() -> None:
-    found = decisions(1, Sensor("rear", half_view_rad=0.9), **MOVING)
-    assert found["rear"].certainty == "assumed"
-    assert "sensors.rear.mount" in str(found["rear"].question)
+def test_a_lone_radar_in_a_convoy_is_asked_for() -> None:
+    found = decisions(1, Sensor("radar", half_view_rad=0.9), **CONVOY)
+    assert found["radar"].certainty == "open"
+    assert "sensors.radar.mount" in str(found["radar"].question)
+
+
+def test_traffic_confirms_that_a_lone_radar_looks_ahead() -> None:
+    found = decisions(1, Sensor("radar", half_view_rad=0.9), parked=0)
+    assert found["radar"].certainty == "tested"
+    assert "objects stand still or move along" in found["radar"].reason
+    assert "sensors.radar.mount" in str(found["radar"].question)
 
 
 def test_a_given_mount_is_not_asked_for() -> None:
     mount = {"sensors.rear.mount": {"x_m": -1.0, "yaw_rad": 3.14}}
-    assert "rear" not in decisions(1, FRONT, REAR, given=mount, **MOVING)
+    assert "rear" not in decisions(1, FRONT, REAR, given=mount, **CONVOY)
 
 
 LEFT = Sensor("left", 0.3, 2.0, 1.0, "sensor", 1.5, clutter=0.2)
@@ -73,7 +80,7 @@ RIGHT = Sensor("right", -0.4, 2.0, -1.0, "sensor", 1.5, clutter=0.2)
 
 
 def test_positions_in_frames_that_differ_are_asked_for() -> None:
-    found = decisions(2, LEFT, RIGHT, **MOVING)
+    found = decisions(2, LEFT, RIGHT, **CONVOY)
     for name in ("left", "right"):
         assert found[name].certainty == "open"
         assert f"input.csv.detections.{name}.frame: ego" in str(found[name].question)
@@ -83,7 +90,7 @@ def test_positions_in_frames_that_differ_are_asked_for() -> None:
 def test_the_answer_for_one_frame_shows_the_other_mount() -> None:
     answer = {"input.csv.detections.right.frame": "ego"}
     right = Sensor("right", form="ego", half_view_rad=1.5, clutter=0.2)
-    found = decisions(2, LEFT, right, given=answer, **MOVING)
+    found = decisions(2, LEFT, right, given=answer, parked=0, turning=0.0)
     assert found["left"].certainty == "tested"
     mount = found["left"].settings["sensors", "left", "mount"]
     assert isinstance(mount, dict)
@@ -93,34 +100,35 @@ def test_the_answer_for_one_frame_shows_the_other_mount() -> None:
 def test_sensors_that_agree_may_be_assumed_in_the_ego_frame() -> None:
     one = Sensor("one", form="ego", half_view_rad=1.5, clutter=0.2)
     other = Sensor("other", form="ego", half_view_rad=1.5, clutter=0.2)
-    found = decisions(2, one, other, **MOVING)
+    found = decisions(2, one, other, **CONVOY)
     assert {item.certainty for item in found.values()} <= {"assumed", "tested"}
 
 
 def test_radars_in_different_axes_are_asked_for_together() -> None:
     front = Sensor("front", 0.1, 3.0, half_view_rad=1.3, clutter=0.2)
     left = Sensor("left", 0.8, 2.0, 1.0, half_view_rad=1.3, clutter=0.2)
-    found = decisions(2, front, left, **MOVING)
+    found = decisions(2, front, left, **CONVOY)
     assert {item.certainty for item in found.values()} == {"open"}
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_one_still_object_contradicts_the_assumed_yaw(seed: int) -> None:
-    lone = Sensor("radar", 0.8, half_view_rad=1.3)
-    found = decisions(seed, lone, parked=1)
-    assert found["radar"].certainty == "open"
-    yaw_deg = float(str(found["radar"].reason).split(" is at ")[1].split()[0])
-    assert yaw_deg == pytest.approx(math.degrees(0.8), abs=3.0)
+@pytest.mark.parametrize("parked", [0, 1])
+def test_traffic_shows_the_yaw_of_a_lone_radar(seed: int, parked: int) -> None:
+    found = decisions(seed, Sensor("radar", 0.8, half_view_rad=1.3), parked=parked)
+    assert found["radar"].certainty == "tested"
+    assert yaw_rad(found["radar"]) == pytest.approx(0.8, abs=0.03)
+    assert "components without an interval" in str(found["radar"].question)
 
 
-def test_one_still_object_confirms_the_assumed_yaw() -> None:
-    lone = Sensor("radar", half_view_rad=1.3)
-    assert decisions(1, lone, parked=1)["radar"].certainty == "assumed"
+def yaw_rad(decision: Decision) -> float:
+    mount = decision.settings["sensors", decision.about, "mount"]
+    assert isinstance(mount, dict)
+    return float(mount["yaw_rad"])
 
 
-def test_sensors_that_agree_on_a_turned_axis_are_asked_for() -> None:
+def test_sensors_that_agree_on_a_turned_axis_are_mounted_by_the_traffic() -> None:
     top = Sensor("top", math.pi / 2, form="sensor", half_view_rad=math.pi, clutter=0.2)
     radar = Sensor("radar", 0.0, 3.0, half_view_rad=0.9, clutter=0.2)
     found = decisions(1, top, radar, parked=1)
-    assert {item.certainty for item in found.values()} == {"open"}
-    assert "top: an object stands still if its axis is at 9" in found["top"].reason
+    assert yaw_rad(found["top"]) == pytest.approx(math.pi / 2, abs=0.03)
+    assert "radar" not in found or found["radar"].certainty == "tested"

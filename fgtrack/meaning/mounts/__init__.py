@@ -9,16 +9,22 @@ The standard deviations are a jackknife over stretches of time, as in
 `fgtrack.clocks.offsets`: it includes time-correlated errors.
 """
 
-import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 
-from fgtrack.meaning.mounts.estimate import IN_MAP, UNKNOWN, MountEstimate, Mounts
+from fgtrack.meaning.mounts.estimate import (
+    IN_MAP,
+    UNKNOWN,
+    MountEstimate,
+    Mounts,
+    Traffic,
+)
 from fgtrack.meaning.mounts.fit import Free, sight_errors, solved
 from fgtrack.meaning.mounts.groups import FEWEST_COMMON, Group, groups_of
 from fgtrack.meaning.mounts.pose import Pose2
-from fgtrack.meaning.mounts.reference import with_reference
+from fgtrack.meaning.mounts.reference import Reference, with_reference, yaw_of_sensor
 from fgtrack.meaning.mounts.sensor_tracks import SensorTracks, sensor_tracks
 from fgtrack.meaning.mounts.table import table_of
 from fgtrack.meaning.tracklets import EgoMotion, Points
@@ -49,9 +55,10 @@ def estimated_mounts(
     }
     sensors = {name: item for name, item in sensors.items() if item.tracks}
     in_map = [name for name in sorted(sensors) if sensors[name].points.in_map]
+    yaws = cache(lambda name: yaw_of_sensor(name, sensors[name], motion))
     found: dict[str, MountEstimate] = {}
     references: dict[str, str] = {}
-    for group in groups_of(sensors, [*in_map, *preferred]):
+    for group in groups_of(sensors, [*in_map, *preferred], yaws):
         for item in _group_estimates(sensors, group, motion, assumed):
             found[item.sensor] = item
             references[item.sensor] = group.reference
@@ -84,8 +91,9 @@ def _group_estimates(
     poses = base.poses
     radial = sight_errors(table, poses, root)
     best = solved(table, poses, root, Free(radial=radial)) if radial else base
+    reference = Reference(IN_MAP, "none")
     if not is_map:
-        best = with_reference(table, best, root, radial, motion)
+        best, reference = with_reference(table, best, root, radial, motion)
     result = []
     for k, name in enumerate(names):
         if sensors[name].points.in_map:
@@ -97,21 +105,12 @@ def _group_estimates(
         count = group.support[name]
         why = f"{count} detections in common with other sensors"
         if k == 0:
-            why = (
-                f"{best.still} objects stand still"
-                if best.still
-                else "no object that stands still shows it"
-            )
-            if best.contrary_yaw_rad is not None:
-                yaw_deg = math.degrees(best.contrary_yaw_rad)
-                why = f"an object stands still if its axis is at {yaw_deg:.0f} degrees, not ahead"
+            why = reference.why
         elif radial:
             why += ", with an error along the sight"
         stds = tuple(best.stds[3 * k : 3 * k + 3].tolist())
         dof = tuple(best.dof[3 * k : 3 * k + 3].tolist())
-        contrary_rad = None if k else best.contrary_yaw_rad
-        item = MountEstimate(
-            name, *pose, stds, dof, count, why, contrary_yaw_rad=contrary_rad
-        )
+        traffic: Traffic = "none" if k else reference.traffic
+        item = MountEstimate(name, *pose, stds, dof, count, why, traffic=traffic)
         result.append(item.judged(assumed.get(name, Pose2())))
     return result

@@ -11,32 +11,44 @@ import numpy as np
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import psd_solve
-from fgtrack.core.types import BoolArray
+from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.meaning.mounts.pose import QUARTER, Pose2
 from fgtrack.meaning.mounts.sensor_tracks import Common
 
 __all__ = [
     "GATES",
-    "STEP_RAD",
-    "YAWS_RAD",
+    "ANY_YAW",
     "Alignment",
+    "YawRange",
     "aligned",
     "matched",
     "refined",
 ]
 
 #: Step of the yaw, size of the cells of offsets, and largest and usual lever arm between two sensors.
-STEP_RAD = math.radians(2.0)
-YAWS_RAD = np.arange(-math.pi, math.pi, STEP_RAD)
+_STEP_RAD = math.radians(2.0)
+_YAWS_RAD = np.arange(-math.pi, math.pi, _STEP_RAD)
 _CELL_M = 1.0
 _REACH_M = 12.0
 _USUAL_ARM_M = 5.0
-#: Yaws that differ by more are other yaws.
+_CELLS = round(2.0 * _REACH_M / _CELL_M)
+#: Yaws and offsets that differ by more are rivals.
 _OTHER_RAD = 0.3
+_OTHER_M = 3.0
 #: Gates of two tracklets of one object, in standard deviations, and the usual error of the alignment before each.
 GATES = ((4.0, 1.0, 0.03), (4.0, 0.4, 0.01), (4.0, 0.2, 0.005))
 #: Weak prior of the lever arm, as a standard deviation: vehicles are shorter.
 _PRIOR_M = 20.0
+
+
+class YawRange(NamedTuple):
+    """Yaw with its largest error."""
+
+    yaw_rad: float
+    error_rad: float
+
+
+ANY_YAW = YawRange(0.0, math.pi)
 
 
 class Alignment(NamedTuple):
@@ -46,41 +58,43 @@ class Alignment(NamedTuple):
     support: float
     """Number of common detections, less for long lever arms."""
     runner_up: float = 0.0
-    """Largest support of another yaw."""
+    """Largest support of a rival."""
 
 
-def aligned(common: Common) -> Alignment:
-    """Return the mount of the second sensor in the frame of the first, by a search over the yaw circle."""
-    count = round(2.0 * _REACH_M / _CELL_M)
-    centres_m = (np.arange(count) + 0.5) * _CELL_M - _REACH_M
+def aligned(common: Common, known: YawRange = ANY_YAW) -> Alignment:
+    """Return the mount of the second sensor in the frame of the first, by a search over yaws and offsets.
+
+    The search is restricted to the yaws in `known`. Then a rival has another offset;
+    otherwise it has another yaw.
+    """
+    turns = np.cos(_YAWS_RAD - known.yaw_rad) >= math.cos(known.error_rad)
+    yaws_rad = _YAWS_RAD[turns]
+    centres_m = (np.arange(_CELLS) + 0.5) * _CELL_M - _REACH_M
     arms_m2 = np.square(centres_m)[:, None] + np.square(centres_m)
     prior = np.exp(-0.5 * arms_m2 / _USUAL_ARM_M**2)
-    best = Alignment(Pose2(), 0.0)
-    supports = list[float]()
-    for yaw_rad in YAWS_RAD.tolist():
-        cells = (
-            common.first_m - common.second_m @ rotation(yaw_rad).T + _REACH_M
-        ) // _CELL_M
-        inside = ((cells >= 0) & (cells < count)).all(axis=1)
-        x, y = cells[inside].astype(np.int64).T
-        counts = (
-            np.bincount(x * count + y, minlength=count**2)
-            .reshape(count, count)
-            .astype(float)
-        )
-        padded = np.pad(counts, 1)
-        near = sum(
-            padded[i : i + count, j : j + count] for i in range(3) for j in range(3)
-        )
-        support = near * prior
-        row, column = np.unravel_index(int(np.argmax(support)), support.shape)
-        supports.append(float(support[row, column]))
-        if support[row, column] > best.support:
-            pose = Pose2(yaw_rad, float(centres_m[row]), float(centres_m[column]))
-            best = Alignment(pose, float(support[row, column]))
-    yaws_rad = YAWS_RAD - best.pose.yaw_rad
-    others = np.array(supports)[np.cos(yaws_rad) < math.cos(_OTHER_RAD)]
-    return best._replace(runner_up=float(others.max()))
+    support = np.array([_counts(common, yaw) * prior for yaw in yaws_rad.tolist()])
+    best, row, column = np.unravel_index(int(np.argmax(support)), support.shape)
+    pose = Pose2(float(yaws_rad[best]), float(centres_m[row]), float(centres_m[column]))
+    if turns.all():
+        rivals = support[np.cos(yaws_rad - pose.yaw_rad) < math.cos(_OTHER_RAD)]
+    else:
+        away_m = np.hypot(centres_m[:, None] - pose.x_m, centres_m - pose.y_m)
+        rivals = support[:, away_m > _OTHER_M]
+    return Alignment(
+        pose, float(support[best, row, column]), float(rivals.max(initial=0.0))
+    )
+
+
+def _counts(common: Common, yaw_rad: float) -> FloatArray:
+    """Return the numbers of common positions at offsets x, y near the centre of each cell."""
+    offsets_m = common.first_m - common.second_m @ rotation(yaw_rad).T
+    cells = (offsets_m + _REACH_M) // _CELL_M
+    inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
+    x, y = cells[inside].astype(np.int64).T
+    counts = np.bincount(x * _CELLS + y, minlength=_CELLS**2).astype(float)
+    padded = np.pad(counts.reshape(_CELLS, _CELLS), 1)
+    near = [padded[i : i + _CELLS, j : j + _CELLS] for i in range(3) for j in range(3)]
+    return np.asarray(sum(near))
 
 
 def matched(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +18,7 @@ __all__ = [
     "SURE",
     "UNKNOWN",
     "MountEstimate",
+    "Traffic",
     "Mounts",
     "is_significant",
     "t_quantile",
@@ -29,12 +31,21 @@ SURE = 0.0005
 _SMALLEST_RAD = 0.005
 SMALLEST_M = 0.1
 _KNOWN_YAW_RAD = 0.05
+#: Half width from which a lever arm is known roughly; the unknown hulls of a few objects cause less.
+_ROUGH_M = 2.0
 
 
 IN_MAP = "its detections are in the map"
 """Reason of a sensor without a mount."""
 UNKNOWN = (math.inf, math.inf, math.inf)
 """Standard deviations of an unknown mount."""
+
+
+Traffic = Literal["shows", "allows", "contradicts", "undecided", "none"]
+"""The traffic shows the yaw of the reference, makes the assumed yaw probable or improbable, or does not decide.
+
+`none`: the ego does not move past objects.
+"""
 
 
 @dataclass(frozen=True)
@@ -55,8 +66,8 @@ class MountEstimate:
     """A line on the data behind the estimate, or the reason why there is no estimate."""
     is_off: bool = False
     """True if the mount differs from the assumed one significantly (99.9 %), and enough to matter."""
-    contrary_yaw_rad: float | None = None
-    """Yaw at which an object stands still, against the assumed yaw; too few objects for an estimate."""
+    traffic: Traffic = "none"
+    """What the motion of the objects past the ego shows about the yaw of a reference."""
 
     @property
     def pose(self) -> Pose2:
@@ -77,18 +88,15 @@ class MountEstimate:
         return all(map(math.isfinite, self.half_widths))
 
     @property
+    def rough_components(self) -> tuple[str, ...]:
+        """Components of the lever arm that are estimated, but within more than 2 m (95 %)."""
+        widths = zip(("x_m", "y_m"), self.half_widths[1:], strict=True)
+        return tuple(name for name, half in widths if _ROUGH_M < half < math.inf)
+
+    @property
     def is_sure_of_yaw(self) -> bool:
         """True if the yaw is known within 0.05 rad (95 %)."""
         return self.half_widths[0] < _KNOWN_YAW_RAD
-
-    @property
-    def significant_pose(self) -> Pose2:
-        """Yaw, x and y; a lever arm or a yaw whose interval contains 0 is 0."""
-        values = [
-            value if abs(value) > half or not math.isfinite(half) else 0.0
-            for value, half in zip(self.pose, self.half_widths, strict=True)
-        ]
-        return Pose2(*values)
 
     @property
     def words(self) -> str:

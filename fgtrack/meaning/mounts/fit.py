@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import rotation
-from fgtrack.core.jackknife import Information, jackknife
+from fgtrack.core.jackknife import Information, dof_of_sum, jackknife
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.meaning.mounts.estimate import FEWEST_DOF, SMALLEST_M, SURE, t_quantile
@@ -24,13 +24,16 @@ __all__ = [
 ]
 
 _ROUNDS = 5
-#: Weak prior of the mounts, as a standard deviation: vehicles are shorter.
-_PRIOR_M = 20.0
+#: Weak prior, as standard deviations: lever arms on vehicles, and errors along the sight, which hulls cause.
+_PRIOR_M = 5.0
+_PRIOR_SIGHT_M = 3.0
 _PRIOR_RAD = 100.0
 _CONVERGED = 1e-3
 #: Standard deviation of the detected points of a hull, and degrees of freedom of objects that show that they differ.
 _HULL_M = 1.0
 _FEWEST_OBJECTS_DOF = 1.5
+#: Degrees of freedom of this standard deviation, which is known from experience.
+_HULL_DOF = 20.0
 #: Largest chance at which a jackknife over other clusters counts as larger.
 _LARGER = 0.05
 #: Speed of an object that may stand still, and its shortest observation.
@@ -52,8 +55,6 @@ class Solution(NamedTuple):
     dof: FloatArray
     still: int
     """Number of objects that stand still."""
-    contrary_yaw_rad: float | None = None
-    """Yaw of the reference at which few objects stand still, against its assumed yaw."""
 
 
 class Free(NamedTuple):
@@ -71,6 +72,7 @@ def solved(table: Table, poses: Sequence[Pose2], root: Pose2, free: Free) -> Sol
     radial_m = np.zeros(len(free.radial))
     prior = np.full(size, _PRIOR_M**-2.0)
     prior[: 3 * count : 3] = _PRIOR_RAD**-2.0
+    prior[3 * count :] = _PRIOR_SIGHT_M**-2.0
     still = np.zeros(len(table.runs), dtype=bool)
     used = np.zeros(size, dtype=bool)
     used[:3] = free.root
@@ -82,9 +84,11 @@ def solved(table: Table, poses: Sequence[Pose2], root: Pose2, free: Free) -> Sol
         if any(free.root) and number < 2:
             still = still_mask(table, fit.velocities_mps)
         H = fit.H.sum(axis=0) + np.diag(prior)
+        values = np.concatenate([[0.0, *pose[1:]] for pose in (root, *poses[1:])])
+        g = fit.g.sum(axis=0) + prior * np.concatenate([values, radial_m])
         d = np.zeros(size)
         if used.any():
-            d[used] = -psd_solve(H[np.ix_(used, used)], fit.g.sum(axis=0)[used])
+            d[used] = -psd_solve(H[np.ix_(used, used)], g[used])
         root = root.shifted(d[:3])
         poses[1:] = [
             pose.shifted(d[3 * k : 3 * k + 3]) for k, pose in enumerate(poses[1:], 1)
@@ -145,6 +149,7 @@ def _spread(
         dof = np.where(larger, other_dof, dof)
     few = other_dof < _FEWEST_OBJECTS_DOF
     share = np.square(hulls) / (1.0 + np.maximum(other_dof, 0.0))
+    dof = np.where(few, dof_of_sum(np.square(std), dof, share, _HULL_DOF), dof)
     return np.where(few, np.sqrt(np.square(std) + share), std), dof
 
 

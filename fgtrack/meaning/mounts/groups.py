@@ -1,12 +1,13 @@
 """Groups of sensors with common objects, and the objects of a group."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 
-from fgtrack.meaning.mounts.alignment import GATES, aligned, matched, refined
+from fgtrack.meaning.mounts.alignment import GATES, YawRange, aligned, matched, refined
 from fgtrack.meaning.mounts.pose import Pose2, inverse
 from fgtrack.meaning.mounts.sensor_tracks import Common, SensorTracks, common_positions
 
@@ -32,9 +33,14 @@ class Group:
 
 
 def groups_of(
-    sensors: Mapping[str, SensorTracks], preferred: Sequence[str]
+    sensors: Mapping[str, SensorTracks],
+    preferred: Sequence[str],
+    yaws: Callable[[str], YawRange | None],
 ) -> list[Group]:
-    """Return the groups of sensors with common objects; sensors in `preferred` come first as references."""
+    """Return the groups of sensors with common objects; sensors in `preferred` come first as references.
+
+    `yaws` returns the yaw of a single sensor in the ego; None if it is unknown.
+    """
     commons: dict[tuple[str, str], Common] = {}
     links: list[tuple[float, str, str, Pose2]] = []
     for first, second in combinations(sensors, 2):
@@ -45,16 +51,9 @@ def groups_of(
         if sensors[first].points.in_map and sensors[second].points.in_map:
             links.append((float(FEWEST_COMMON), first, second, Pose2()))
             continue
-        start = aligned(common)
-        pose, pairs = refined(common, start.pose)
-        count = sum(pairs.values())
-        # The sensor that detects less limits the number of common detections.
-        possible = min(
-            len(np.unique(each, axis=0)) for each in (common.first_m, common.second_m)
-        )
-        is_unique = start.support >= _UNIQUE * start.runner_up
-        if is_unique and count >= max(FEWEST_COMMON, _LEAST_COMMON * possible):
-            links.append((float(count), first, second, pose))
+        link = _link(common) or _link_by_yaws(common, yaws(first), yaws(second))
+        if link is not None:
+            links.append((*link[:1], first, second, link[1]))
     groups: list[Group] = []
     rest = sorted(
         sensors,
@@ -67,6 +66,41 @@ def groups_of(
         groups.append(group)
         rest = [name for name in rest if name not in group.poses]
     return groups
+
+
+def _link(common: Common) -> tuple[float, Pose2] | None:
+    """Return the number of common detections of two sensors, and the mount of the second one in the first.
+
+    None if the mount is not unique.
+    """
+    start = aligned(common)
+    pose, pairs = refined(common, start.pose)
+    count = sum(pairs.values())
+    # The sensor that detects less limits the number of common detections.
+    possible = min(
+        len(np.unique(each, axis=0)) for each in (common.first_m, common.second_m)
+    )
+    is_unique = start.support >= _UNIQUE * start.runner_up
+    if is_unique and count >= max(FEWEST_COMMON, _LEAST_COMMON * possible):
+        return float(count), pose
+    return None
+
+
+def _link_by_yaws(
+    common: Common, first: YawRange | None, second: YawRange | None
+) -> tuple[float, Pose2] | None:
+    """Return the link of two sensors whose yaws in the ego are known; their views may hardly overlap."""
+    if first is None or second is None:
+        return None
+    known = YawRange(second.yaw_rad - first.yaw_rad, first.error_rad + second.error_rad)
+    start = aligned(common, known)
+    pose, pairs = refined(common, start.pose)
+    count = sum(pairs.values())
+    is_near = math.cos(pose.yaw_rad - known.yaw_rad) >= math.cos(known.error_rad)
+    is_unique = start.support >= _UNIQUE * start.runner_up
+    if is_near and is_unique and count >= FEWEST_COMMON:
+        return float(count), pose
+    return None
 
 
 def _rank(name: str, preferred: Sequence[str]) -> int:

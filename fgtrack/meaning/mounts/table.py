@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import rotations
+from fgtrack.core.geometry import rotation, rotations
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.meaning.mounts.groups import Group, num_detections, objects_of
 from fgtrack.meaning.mounts.pose import QUARTER, Pose2
@@ -19,6 +19,8 @@ __all__ = ["Table", "rows_of", "table_of"]
 _STRETCH_S = 5.0
 #: Most detections of all sensors in the fit.
 _MOST_ROWS = 12_000
+#: Number of detections before and after a detection that show its sight.
+_NEIGHBOURS = 5
 
 
 class Table(NamedTuple):
@@ -32,6 +34,8 @@ class Table(NamedTuple):
     """Number of the object's stretch, shape (n,)."""
     times_s: FloatArray
     points_m: FloatArray
+    around_m: FloatArray
+    """Mean positions of the detections of the same object by the same sensor before and after, shape (n, 2)."""
     poses: FloatArray
     noise: FloatArray
     """Noise of the sensors, shape (n, 2, 2), as in `Rows`."""
@@ -74,10 +78,35 @@ def table_of(sensors: Mapping[str, SensorTracks], group: Group) -> Table:
         runs.ravel(),
         times_s[order],
         at_m[order],
+        _around_m(at_m[order], runs.ravel(), numbers[order]),
         poses[order],
         noise[order],
         in_map[order],
     )
+
+
+def _around_m(points_m: FloatArray, runs: IntArray, sensors: IntArray) -> FloatArray:
+    """Return the mean of the detections before and after each detection in its run, shape (n, 2).
+
+    The detection itself is left out, so that its error does not count.
+    """
+    order = np.lexsort((np.arange(len(runs)), sensors, runs))
+    keys = np.column_stack([runs, sensors])[order]
+    first = np.append(True, np.diff(keys, axis=0).any(axis=1))
+    starts = np.flatnonzero(first)
+    number = np.cumsum(first) - 1
+    ends = np.append(starts[1:], len(runs))
+    rows = np.arange(len(runs))
+    low = np.maximum(rows - _NEIGHBOURS, starts[number])
+    high = np.minimum(rows + _NEIGHBOURS + 1, ends[number])
+    sums_m = np.concatenate([np.zeros((1, 2)), np.cumsum(points_m[order], axis=0)])
+    count = np.maximum(high - low - 1, 1)[:, None]
+    means_m = (sums_m[high] - sums_m[low] - points_m[order]) / count
+    alone = high - low < 2
+    means_m[alone] = points_m[order][alone]
+    result = np.empty_like(points_m)
+    result[order] = means_m
+    return result
 
 
 def rows_of(
@@ -122,8 +151,11 @@ def rows_of(
     A[body, :, 1:3] = turns[body]
     for column, k in enumerate(radial, start=3 * count):
         mine = table.sensors == k
-        sight = turned_m[mine] / np.maximum(np.hypot(*turned_m[mine].T), 1e-6)[:, None]
-        A[mine, :, column] = np.einsum("nij,nj->ni", full[mine], sight)
+        # The sight of the detection itself contains its error.
+        around_m = table.around_m[mine]
+        sight = around_m / np.maximum(np.hypot(*around_m.T), 1e-6)[:, None]
+        A[mine, :, column] = sight @ rotation(poses[k].yaw_rad).T
+        A[mine, :, column] = np.einsum("nij,nj->ni", full[mine], A[mine, :, column])
     mounts_m = np.einsum("nij,nj->ni", full, shifts_m) + np.einsum(
         "nij,nj->ni", turns, root_m
     )
