@@ -129,7 +129,7 @@ def config(
         Option("--list", help="List the shipped configurations, scenarios and sweeps."),
     ] = False,
 ) -> None:
-    """Print the resolved configuration or a scenario, or list the shipped ones.
+    """Print a configuration or a scenario, or list the shipped ones.
 
     A scenario is printed with the meaning and the default of each key. The printed text
     is a scenario file.

@@ -573,7 +573,7 @@ def test_births_that_die_unconfirmed_are_not_fine(call: Call) -> None:
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_page_on_advice_quotes_the_command(call: Call) -> None:
     page = (Path(__file__).parents[2] / "docs/advise.md").read_text()
     quoted = page.partition("```text\n")[2].partition("```")[0]

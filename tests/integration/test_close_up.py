@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.pictures import faults
+from support.runs import replayed
 
 import fgtrack
 from fgtrack.cli.main import run as command
@@ -20,18 +21,7 @@ NAMES = ("ekf-replay", "ekf-backward-forward")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six seconds of the default scenario, replayed with two filters."""
-    folder = tmp_path_factory.mktemp("close-up")
-    fgtrack.simulate("default", seed=3, duration_s=6.0, out=folder / "drive.jsonl")
-    for name in NAMES:
-        fgtrack.replay(
-            folder / "drive.jsonl",
-            "tuned",
-            map="oval",
-            pit_map="oval",
-            estimator=name,
-            out=folder / "runs" / name,
-        )
-    return folder
+    return replayed(tmp_path_factory.mktemp("close-up"), 6.0, NAMES)
 
 
 @pytest.fixture(scope="module")

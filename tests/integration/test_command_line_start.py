@@ -34,27 +34,33 @@ def test_the_help_imports_nothing_heavy() -> None:
     assert loaded_by("from fgtrack.cli.main import run; run(['--help'])") == set()
 
 
-@pytest.mark.parametrize(
-    "arguments", [["config"], ["config", "-c", "smoother"], ["config", "--list"]]
-)
-def test_the_configuration_is_printed_without_a_compiler_and_without_readers(
-    arguments: list[str],
-) -> None:
+def called(*commands: list[str]) -> str:
+    """Program that runs `commands` in one process."""
+    return (
+        "from fgtrack.cli.main import run\n"
+        f"for words in {list(commands)!r}: assert run(words) == 0\n"
+    )
+
+
+def test_the_configuration_is_printed_without_a_compiler_and_without_readers() -> None:
     loaded = loaded_by(
-        f"from fgtrack.cli.main import run; assert run({arguments!r}) == 0"
+        called(["config"], ["config", "-c", "smoother"], ["config", "--list"])
     )
     assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas", "rosbags"})
 
 
-@pytest.mark.parametrize("name", ["drive.jsonl", "drive"])
-@pytest.mark.parametrize("options", [[], ["-c", "smoother"]])
-def test_the_contents_of_a_recording_are_listed_without_a_compiler(
-    options: list[str], name: str, tmp_path
-) -> None:
-    recording = str(tmp_path / name)
-    assert run(["simulate", "default", "--duration", "0.5", "-o", recording]) == 0
+def test_the_contents_of_a_recording_are_listed_without_a_compiler(tmp_path) -> None:
+    recordings = [str(tmp_path / name) for name in ("drive.jsonl", "drive")]
+    for each in recordings:
+        assert run(["simulate", "default", "--duration", "0.5", "-o", each]) == 0
     loaded = loaded_by(
-        f"from fgtrack.cli.main import run; assert run({['info', recording, *options]!r}) == 0"
+        called(
+            *(
+                ["info", each, *options]
+                for each in recordings
+                for options in ([], ["-c", "smoother"])
+            )
+        )
     )
     assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas"})
 

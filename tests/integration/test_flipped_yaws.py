@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.cases import each_once
 
 import fgtrack
 from fgtrack.core.geometry import rotation
@@ -241,26 +242,32 @@ def test_one_car_stays_one_track(drive: str, flips: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "sensor",
-    [
-        Sensor(hz=2.0, flips=0.2),
-        Sensor(hz=25.0, flips=0.3),
-        Sensor(std_m=0.1, yaw_std_rad=0.05, flips=0.3),
-        Sensor(std_m=2.0, yaw_std_rad=0.4, flips=0.3),
-        Sensor(flips=0.15, row=5),
-        Sensor(flips=0.1, astray=0.2),
-        Sensor(flips=0.3, frame="ego", has_covariance=True),
-        Sensor(is_first_flipped=True, flips=0.1),
-        Sensor(flips=0.2, speed_std_mps=0.3),
-        Sensor(flips=0.2, delay_s=(0.1, 1.0)),
-    ],
-    ids=lambda sensor: ", ".join(
-        f"{key} {value}"
-        for key, value in vars(sensor).items()
-        if value != vars(Sensor())[key]
+    ("drive", "sensor"),
+    each_once(
+        ["straight", "U-turn"],
+        [
+            Sensor(hz=2.0, flips=0.2),
+            Sensor(hz=25.0, flips=0.3),
+            Sensor(std_m=0.1, yaw_std_rad=0.05, flips=0.3),
+            Sensor(std_m=2.0, yaw_std_rad=0.4, flips=0.3),
+            Sensor(flips=0.15, row=5),
+            Sensor(flips=0.1, astray=0.2),
+            Sensor(flips=0.3, frame="ego", has_covariance=True),
+            Sensor(is_first_flipped=True, flips=0.1),
+            Sensor(flips=0.2, speed_std_mps=0.3),
+            Sensor(flips=0.2, delay_s=(0.1, 1.0)),
+        ],
+    ),
+    ids=lambda value: (
+        value
+        if isinstance(value, str)
+        else ", ".join(
+            f"{key} {own}"
+            for key, own in vars(value).items()
+            if own != vars(Sensor())[key]
+        )
     ),
 )
-@pytest.mark.parametrize("drive", ["straight", "U-turn"])
 def test_one_car_stays_one_track_with_other_errors_and_rates(
     drive: str, sensor: Sensor
 ) -> None:
@@ -271,9 +278,13 @@ def test_one_car_stays_one_track_with_other_errors_and_rates(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("delay_s", [(0.05, 0.05), (0.1, 1.0)])
 @pytest.mark.parametrize(
-    "estimator", ["ukf-replay", "imm-replay", "smoother-banded", "smoother"]
+    ("estimator", "delay_s"),
+    each_once(
+        ["ukf-replay", "imm-replay", "smoother-banded", "smoother"],
+        [(0.05, 0.05), (0.1, 1.0)],
+    ),
+    ids=str,
 )
 def test_every_estimator_keeps_one_track(
     estimator: str, delay_s: tuple[float, float]

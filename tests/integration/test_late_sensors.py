@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from support.cases import each_once
 
 from fgtrack.config.settings import Config
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackStatus
@@ -146,20 +147,23 @@ def tracked(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"]
-)
-@pytest.mark.parametrize(
-    ("rates_hz", "delay_s", "noise_m"),
-    [
-        ((10.0, 10.0), 0.1, 2.0),
-        ((25.0, 2.0), 0.6, 0.1),
-        ((2.0, 25.0), 1.2, 0.3),
-        ((12.0, 5.0), 3.0, 0.3),
-    ],
+    ("estimator", "case"),
+    each_once(
+        ["ekf-replay", "imm-replay", "smoother-banded", "smoother"],
+        [
+            ((10.0, 10.0), 0.1, 2.0),
+            ((25.0, 2.0), 0.6, 0.1),
+            ((2.0, 25.0), 1.2, 0.3),
+            ((12.0, 5.0), 3.0, 0.3),
+        ],
+    ),
+    ids=str,
 )
 def test_an_object_that_only_a_late_sensor_sees_is_one_confirmed_track(
-    estimator: str, rates_hz: tuple[float, float], delay_s: float, noise_m: float
+    estimator: str, case: tuple[tuple[float, float], float, float]
 ) -> None:
+    """A case has the rates of both sensors in Hz, the delay of the second, and the noise in m."""
+    rates_hz, delay_s, noise_m = case
     watched = [Watched(rates_hz[0]), Watched(rates_hz[1], delay_s)]
     tracker = Tracker(config(2, estimator, noise_m))
     found = tracked(tracker, watched, delay_s + 7.0, noise_m)
@@ -293,23 +297,22 @@ def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"]
-)
-@pytest.mark.parametrize(
-    ("rates_hz", "ahead_s", "noise_m"),
-    [
-        ((10.0, 10.0), (0.2, 0.0), 0.3),
-        ((2.0, 2.0), (0.45, 0.0), 0.1),
-        ((25.0, 5.0), (0.0, 0.95), 1.0),
-        ((4.0, 4.0, 4.0, 4.0), (0.0, 0.3, 0.9, 0.1), 0.3),
-    ],
+    ("estimator", "case"),
+    each_once(
+        ["ekf-replay", "imm-replay", "smoother-banded", "smoother"],
+        [
+            ((10.0, 10.0), (0.2, 0.0), 0.3),
+            ((2.0, 2.0), (0.45, 0.0), 0.1),
+            ((25.0, 5.0), (0.0, 0.95), 1.0),
+            ((4.0, 4.0, 4.0, 4.0), (0.0, 0.3, 0.9, 0.1), 0.3),
+        ],
+    ),
+    ids=str,
 )
 def test_a_clock_that_is_ahead_swaps_no_objects(
-    estimator: str,
-    rates_hz: tuple[float, ...],
-    ahead_s: tuple[float, ...],
-    noise_m: float,
+    estimator: str, case: tuple[tuple[float, ...], tuple[float, ...], float]
 ) -> None:
+    rates_hz, ahead_s, noise_m = case
     """A first detection of one object, with an unknown velocity, does not take those of another, 60 m away."""
     watched = [
         Watched(rate_hz, 0.06, ahead)

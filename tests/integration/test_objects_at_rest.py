@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.cases import each_once
 
 import fgtrack
 from fgtrack.core.types import FloatArray
@@ -68,8 +69,9 @@ def assert_within(means: FloatArray, covariances: FloatArray) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("motion", [POLAR, CARTESIAN], ids=["ctrv", "ct"])
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize(
+    ("name", "motion"), each_once(FAST, [POLAR, CARTESIAN]), ids=str
+)
 def test_a_parked_object_seen_by_positions_does_not_turn(
     name: str, motion: fgtrack.MotionModel
 ) -> None:

@@ -281,7 +281,8 @@ def test_the_configuration_of_a_run_is_accepted_wherever_a_configuration_is(
         **run.config,
         "smoother": {**run.config["smoother"], "lag_s": 0.5},
     }
-    assert fgtrack.tune(drive / "drive.mcap", run.config)
+    with pytest.raises(fgtrack.CallError, match="not a noise parameter of the conf"):
+        fgtrack.tune(drive / "drive.mcap", run.config, keep=["smoother.lag_s"])
     with pytest.raises(fgtrack.CallError, match=r"smoother\.lag: "):
         fgtrack.Tracker({"smoother": {"lag": 1.0}})
     with pytest.raises(fgtrack.CallError, match="must be a mapping of settings"):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.runs import replayed
 
 import fgtrack
 from fgtrack.cli.main import run as command
@@ -29,19 +30,8 @@ ATOL, ATOL_S = 0.6e-3, 0.6e-4  # m and rad, s
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three seconds of the default scenario, replayed with a filter and a smoother."""
-    folder = tmp_path_factory.mktemp("report")
-    fgtrack.simulate("default", seed=3, duration_s=3.0, out=folder / "drive.jsonl")
-    for name in NAMES:
-        fgtrack.replay(
-            folder / "drive.jsonl",
-            "tuned",
-            map="oval",
-            pit_map="oval",
-            estimator=name,
-            set={"smoother.lagged_s": [0.2, 0.4]},
-            out=folder / "runs" / name,
-        )
-    return folder
+    lagged = {"smoother.lagged_s": [0.2, 0.4]}
+    return replayed(tmp_path_factory.mktemp("report"), 3.0, NAMES, lagged)
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from html import unescape
 from pathlib import Path
 
 import pytest
+from support.runs import replayed
 
-import fgtrack
 from fgtrack.cli.main import run as command
 
 CHROMIUM = next(
@@ -46,17 +46,7 @@ PROBE = """<script>addEventListener("load", async () => {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four seconds of the default scenario, replayed with a filter and a smoother, and their report."""
-    folder = tmp_path_factory.mktemp("viewer")
-    fgtrack.simulate("default", seed=3, duration_s=4.0, out=folder / "drive.jsonl")
-    for name in NAMES:
-        fgtrack.replay(
-            folder / "drive.jsonl",
-            "tuned",
-            map="oval",
-            pit_map="oval",
-            estimator=name,
-            out=folder / "runs" / name,
-        )
+    folder = replayed(tmp_path_factory.mktemp("viewer"), 4.0, NAMES)
     assert (
         command(["report", str(folder / "runs"), "-o", str(folder / "report.html")])
         == 0

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.cases import each_once
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S
@@ -116,10 +117,14 @@ def turned(
     return J @ covariance @ J.T, result
 
 
-@pytest.mark.parametrize("motion", [CTRV(), CTRA()], ids=["ctrv", "ctra"])
-@pytest.mark.parametrize("dt_s", [0.1, 1.0, 3.0])
 @pytest.mark.parametrize(
-    "yaw_std_rad", [0.1, 0.3, 0.7, 1.0, np.pi / 2, np.pi / np.sqrt(3.0), 3.0, 7.0]
+    ("motion", "dt_s", "yaw_std_rad"),
+    each_once(
+        [CTRV(), CTRA()],
+        [0.1, 1.0, 3.0],
+        [0.1, 0.3, 0.7, 1.0, np.pi / 2, np.pi / np.sqrt(3.0), 3.0, 7.0],
+    ),
+    ids=lambda value: type(value).__name__ if isinstance(value, MotionModel) else None,
 )
 def test_a_prediction_has_the_moments_of_the_model_however_wide_the_yaw(
     motion: MotionModel, dt_s: float, yaw_std_rad: float
