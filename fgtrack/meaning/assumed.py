@@ -9,7 +9,7 @@ from typing import Any
 
 from fgtrack.config.motion import NOISE_HZ, MotionConfig
 from fgtrack.config.recorded import Recorded, RecordedSensor, recorded
-from fgtrack.config.settings import Config, FilterConfig
+from fgtrack.config.settings import ClockConfig, Config, FilterConfig
 from fgtrack.config.yaml_file import SMALLEST, plain
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
@@ -19,6 +19,7 @@ from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
 from fgtrack.meaning.components import uninformative
 from fgtrack.meaning.corrected import corrected_message
 from fgtrack.meaning.coverage import Coverage, coverages
+from fgtrack.meaning.single_reports import SingleReports
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.lives.existence import ExistenceRules
@@ -40,6 +41,11 @@ _BOX_STD_M = 0.3
 #: A track out of view continues for this number of periods of the slowest sensor, or of longest silences.
 _LISTS_OUT_OF_VIEW = 2.5
 _SILENCES = 1.5
+#: Ticks for each report of an object, and lifetime of a track in longest usual silences of its object.
+_TICKS_PER_REPORT = 4.0
+_SILENCES_PER_LIFE = 4.0
+#: Largest acceleration across the direction of travel of anything but aircraft: a race car's is 30 m/s^2.
+_LARGEST_TURN_MPS2 = 30.0
 _LEAST_CLUTTER = 0.05
 """Smallest assumed number of false detections in a list; fewer cannot be excluded."""
 #: Share of time-correlated errors in the variance: smaller shares are not modelled, larger ones are limited.
@@ -91,6 +97,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         covered = _covered(source, config, mounts)
         unmodelled = unmodelled_sensors(config, covered)
         rules: list[Rule] = [
+            _report_ticks,
             _slow_revisits,
             _noise,
             _lists,
@@ -184,10 +191,16 @@ def _covered(
     named = set(config.input.detections) | set(config.input.csv.detections)
     result = {name: Coverage() for name in named.difference(config.ignore_sensors)}
     result |= coverages(readable(), mounts)
-    for name, reasons in uninformative(first, mounts).items():
-        informative = result[name].measured - reasons.keys()
+    contrary = uninformative(first, mounts)
+    for name, one in result.items():
+        # Reports of an object decide on its velocities, where they are linked.
+        linked = one.reports
+        reasons = contrary.get(name, {})
+        if linked is not None:
+            untested = reasons.keys() - linked.std.keys()
+            reasons = {key: reasons[key] for key in untested} | linked.uninformative
         result[name] = replace(
-            result[name], measured=informative, uninformative=reasons
+            one, measured=one.measured - reasons.keys(), uninformative=reasons
         )
     return dict(sorted(result.items()))
 
@@ -222,32 +235,90 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
     The standard deviation of a heading after the time t without a measurement is sqrt(q
     t^3 / 3), with the density q of the yaw rate. Above 1 rad, a straight line with the
-    noise `_MANOEUVRES` predicts better. The windows then hold two measurements.
+    noise `_MANOEUVRES` predicts better. It is also better for aircraft, which cannot turn
+    as fast as the default model assumes. The windows then hold two measurements.
     """
-    intervals_s = [item.revisit_s for item in covered.values() if item.num_lists]
+    used = [item for item in covered.values() if item.num_lists]
     limit_s = math.cbrt(3.0 / (MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ))
-    shortest_s = min((item or 0.0 for item in intervals_s), default=0.0)
-    if shortest_s <= limit_s:
+    needed_s = min(map(_prediction_s, used), default=0.0)
+    turn_mps2 = min(map(_turn_mps2, used), default=0.0)
+    if needed_s <= limit_s and turn_mps2 <= _LARGEST_TURN_MPS2:
         return
+    shortest_s = min(item.revisit_s or 0.0 for item in used)
     window_s = min(float(math.ceil(2.0 * shortest_s)), _LONGEST_S)
     reason = (
-        f"an object is measured every {shortest_s:.2g} s, but the default model predicts its heading "
-        f"for {limit_s:.2g} s only"
+        f"an object is measured every {shortest_s:.2g} s, so its heading must be predicted for {needed_s:.2g} s; "
+        f"the default model does so for {limit_s:.2g} s only"
     )
-    settings = {
+    if needed_s <= limit_s:
+        reason = f"the default model assumes turns with {turn_mps2:.2g} m/s2 at the speed of the objects"
+    settings: dict[tuple[str, str], object] = {
         ("motion", "kind"): "cv",
         ("motion", "std_per_s"): _MANOEUVRES,
-        ("clock", "node_hz"): 1.0,
-        ("filter", "storage_s"): window_s,
-        ("smoother", "lag_s"): window_s,
     }
+    if needed_s > limit_s:
+        settings |= {
+            ("clock", "node_hz"): 1.0,
+            ("filter", "storage_s"): window_s,
+            ("smoother", "lag_s"): window_s,
+        }
     for path, value in settings.items():
         if getattr(config, path[0]) == getattr(Config(), path[0]):
             yield Assumption(path, value, reason)
 
 
+def _prediction_s(one: Coverage) -> float:
+    """Time over which the heading of an object is predicted, with the age of its estimate; 0 if unknown."""
+    age_s = 0.0 if one.reports is None else _heading_age_s(one.reports)
+    return (one.revisit_s or 0.0) + age_s
+
+
+def _turn_mps2(one: Coverage) -> float:
+    """Acceleration of a turn that the default model assumes at the speed of single reports.
+
+    0 for other sensors, and for reports that are exact enough to show a turn within two
+    periods.
+    """
+    if one.reports is None or _heading_age_s(one.reports) <= one.reports.period_s:
+        return 0.0
+    return one.reports.speed_mps * MotionConfig().yaw_rate_std_radps
+
+
+def _heading_age_s(reports: SingleReports) -> float:
+    """Age of the best estimate of a heading from noisy positions.
+
+    With positions of the standard deviation s, the period T and the speed v, the heading
+    over the time t has the error s sqrt(12 T / t^3) / v. Turns add sqrt(q t^3 / 3). Both
+    are equal at t^6 = 36 s^2 T / (v^2 q).
+    """
+    speed_mps = max(reports.speed_mps, 1.0)
+    density = MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ
+    std_m = max(reports.along.std_m, reports.across.std_m)
+    sixth_power = 36.0 * std_m**2 * reports.period_s / (speed_mps**2 * density)
+    return math.pow(sixth_power, 1.0 / 6.0)
+
+
+def _report_ticks(config: Config, covered: Coverages) -> Iterator[Assumption]:
+    """Yield the rate of ticks and the lifetime of tracks for objects that all sensors report one by one."""
+    used = [one for one in covered.values() if one.num_lists]
+    reports = [one.reports for one in used if one.reports is not None]
+    if not used or len(reports) < len(used):
+        return
+    period_s = min(one.period_s for one in reports)
+    reason = f"an object is reported every {period_s:.2g} s"
+    default_hz = ClockConfig().node_hz or math.inf
+    node_hz = min(max(float(round(_TICKS_PER_REPORT / period_s)), 1.0), default_hz)
+    if config.clock == ClockConfig() and node_hz < default_hz:
+        yield Assumption(("clock", "node_hz"), node_hz, reason)
+    silence_s = min(one.silence_s for one in reports)
+    lifetime_s = float(f"{_SILENCES_PER_LIFE * silence_s:.2g}")
+    if config.lifecycle == ExistenceRules() and lifetime_s > ExistenceRules.lifetime_s:
+        reason = f"an object is silent for up to {silence_s:.2g} s between its reports"
+        yield Assumption(("lifecycle", "lifetime_s"), lifetime_s, reason)
+
+
 def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield usual standard deviations of the sensors."""
+    """Yield usual standard deviations of the sensors, or larger ones that single reports show."""
     cartesian = {"x_m", "y_m"}
     for name, item in covered.items():
         redundant = (
@@ -263,11 +334,48 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
             if component in components
         }
         reason = USUAL_BOX if item.boxes else USUAL
+        growth: dict[str, float] = {}
+        if item.reports is not None:
+            std, growth = _of_reports(std, item.reports)
+            reason = (
+                f"scatter of {item.reports.num_triples} triples of reports of an object, "
+                f"every {item.reports.period_s:.2g} s; not less than {USUAL}"
+            )
         left_out = [
             f"{component} is not used: {why}"
             for component, why in item.uninformative.items()
         ]
-        yield from _sensor(name, "; ".join([reason, *left_out]), std=std)
+        yield from _sensor(
+            name,
+            "; ".join([reason, *left_out]),
+            std=std,
+            std_growth=growth or None,
+        )
+
+
+def _of_reports(
+    usual: Mapping[str, float], reports: SingleReports
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return standard deviations of single reports, not less than `usual`, and their growth with the range."""
+    measured = dict(reports.std)
+    growth: dict[str, float] = {}
+    if "x_m" in usual:
+        along, across = reports.along, reports.across
+        if along.growth == across.growth == 0.0:
+            measured["x_m"] = measured["y_m"] = math.hypot(
+                along.std_m, across.std_m
+            ) / math.sqrt(2.0)
+        else:
+            measured |= {"x_m": along.std_m, "y_m": across.std_m}
+            trends = {"x_m": along.growth, "y_m": across.growth}
+            growth = {
+                key: float(f"{value:.2g}") for key, value in trends.items() if value
+            }
+    std = {
+        key: max(value, float(f"{measured.get(key, 0.0):.2g}"))
+        for key, value in usual.items()
+    }
+    return std, growth
 
 
 def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
@@ -389,9 +497,9 @@ def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
 def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield windows that hold two lists of the slowest sensor in use."""
     rates_hz = [
-        item.rate_hz
+        item.object_hz
         for name, item in covered.items()
-        if item.rate_hz and name not in config.ignore_sensors
+        if item.object_hz and name not in config.ignore_sensors
     ]
     needed_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
     lag_s = min(needed_s, _LONGEST_S - config.smoother.ring_s)
@@ -439,8 +547,10 @@ def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
     first list without it. Otherwise it is the largest of the default, 2.5 periods of
     the slowest sensor, and 1.5 times the longest silence of a position sensor.
     """
+    if not any(sensor.scan for sensor in config.used_sensors.values()):
+        return  # without scans there are no misses
     periods_s = {
-        name: 1.0 / item.rate_hz for name, item in covered.items() if item.rate_hz
+        name: 1.0 / item.object_hz for name, item in covered.items() if item.object_hz
     }
     position_sensors = [
         name for name, item in config.used_sensors.items() if item.gives_position

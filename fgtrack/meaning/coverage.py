@@ -27,6 +27,7 @@ from fgtrack.meaning.persistence import (
     disagreement_m,
     persistence,
 )
+from fgtrack.meaning.single_reports import NO_ID, SingleReports, single_reports
 from fgtrack.models.sensors import Mount
 
 __all__ = ["Coverage", "coverages"]
@@ -74,6 +75,8 @@ _MOST_REVISITS = 5000
 _FEWEST_REVISITS = 20
 #: Silence of a sensor after which objects count as new.
 _OUTAGE_S = 2.0
+#: Columns of `_Detections.rows`.
+_NUM_COLUMNS = 7
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class Coverage:
     """Median time between two detections of an object; None without positions, or with too few detections."""
     persistence: Persistence | None = None
     """Persistence of the detections from list to list; None if too few recur."""
+    reports: SingleReports | None = None
+    """Objects of a sensor that reports them one by one; None for a sensor that scans, or with too few reports."""
     disagreement_m: float | None = None
     """Smallest standard deviation between positions of this and another sensor; None without common objects."""
     unexplained_m: float = 0.0
@@ -116,6 +121,11 @@ class Coverage:
     """Full angle of the sector; None if the sensor detects all around, or if there are too few detections."""
     range_m: float | None = None
     """Range up to which the sensor detects; None if it measures no range, or if there are too few detections."""
+
+    @property
+    def object_hz(self) -> float | None:
+        """Measurements of an object per second: by its own reports, or by the lists; None if unknown."""
+        return self.rate_hz if self.reports is None else 1.0 / self.reports.period_s
 
 
 def coverages(
@@ -187,10 +197,15 @@ class _Detections:
         self.lists = array("q")
         """Stamp, receipt and number of detections of each list."""
         self.rows = array("d")
-        """Index of the list, x, y, 1 if there is a range else 0, and score (NaN if missing) of each detection.
+        """Index of the list, x, y, 1 if there is a range else 0, score, yaw and speed of each detection.
 
-        A detection with only a bearing has the x and y of a unit vector; a detection without a bearing is left out.
+        Missing numbers are NaN. A detection with only a bearing has the x and y of a unit vector; a detection without a
+        bearing is left out.
         """
+        self.ids = array("q")
+        """Number of the identity of each row, or `NO_ID`."""
+        self.names: dict[str, int] = {}
+        """Numbers of the identities."""
 
     def add(self, message: DetectionList) -> None:
         """Add the detections of `message`."""
@@ -205,8 +220,15 @@ class _Detections:
             )
             x_m, y_m, has_range = _position(detection)
             if math.isfinite(x_m) and math.isfinite(y_m):
-                score = math.nan if detection.score is None else detection.score
-                self.rows.extend((index, x_m, y_m, has_range, score))
+                described = detection.score, detection.yaw_rad, detection.speed_mps
+                numbers = (math.nan if one is None else one for one in described)
+                self.rows.extend((index, x_m, y_m, has_range, *numbers))
+                name = detection.id
+                self.ids.append(
+                    NO_ID
+                    if name is None
+                    else self.names.setdefault(name, len(self.names))
+                )
 
     def coverage(
         self, first_ns: int, path: FloatArray, mount: Mount | None
@@ -215,7 +237,7 @@ class _Detections:
         stamps_ns, receipts_ns, counts = np.array(self.lists).reshape(-1, 3).T
         stamps_s = (stamps_ns - first_ns) / NS_PER_S
         receipts_s = (receipts_ns - first_ns) / NS_PER_S
-        rows = np.array(self.rows).reshape(-1, 5)
+        rows = np.array(self.rows).reshape(-1, _NUM_COLUMNS)
         ranged = rows[rows[:, 3] > 0.0]
         # The rows are sorted by list.
         begins = np.searchsorted(ranged[:, 0], np.arange(len(counts) + 1))
@@ -245,6 +267,8 @@ class _Detections:
                 stamps_ns.tolist(), [ranged[part, 1:3] for part in parts]
             ),
         )
+        if not result.scans and self.frames == {"map"}:
+            result = self._with_reports(result, stamps_s, rows)
         rows = ranged if len(ranged) else rows
         in_map = "map" in self.frames
         if len(self.frames) != 1 or len(rows) < _FEWEST or (in_map and not len(path)):
@@ -314,6 +338,24 @@ class _Detections:
         return replace(
             result, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m
         )
+
+    def _with_reports(
+        self, result: Coverage, stamps_s: FloatArray, rows: FloatArray
+    ) -> Coverage:
+        """Return `result` with the objects of single reports in the map; their sensor is at its origin."""
+        is_ranged = rows[:, 3] > 0.0
+        at_m = rows[is_ranged, 1:3]
+        reports = single_reports(
+            stamps_s[rows[is_ranged, 0].astype(np.int64)],
+            at_m,
+            at_m,
+            np.array(self.ids, dtype=np.int64)[is_ranged],
+            rows[is_ranged, 5:7],
+            result.revisit_s,
+        )
+        if reports is None:
+            return result
+        return replace(result, reports=reports, revisit_s=reports.period_s)
 
 
 def _revisit_s(
