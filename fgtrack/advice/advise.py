@@ -98,7 +98,10 @@ def advise(
     adviser = Adviser(
         str(recording), messages, result, reference, on_step, draft.decisions
     )
-    return adviser.advice(broken, tune, ledger)
+    advice = adviser.advice(broken, tune, ledger)
+    # A question stays open until it is answered, so its sensor is not ignored in the settings.
+    asked = draft.with_assumed(Assumed(advice.config)).assumed.config
+    return replace(advice, config=asked)
 
 
 class Adviser:

@@ -68,6 +68,8 @@ class Ledger:
     tables: Tables = field(repr=False)
     sentence: str
     """Summary of the contributions."""
+    problem: str | None = None
+    """Line on open questions about the recording, whose sensors are left out; None without such questions."""
 
     def __str__(self) -> str:
         return f"{self.tables}\n\n{self.sentence}"
@@ -94,6 +96,7 @@ def ledger(
     track can be assessed.
     """
     settings = read_config(config, set, track_map=map, pit_map=pit_map)
+    problem = None
     if isinstance(recording, str | Path):
         path = Path(recording)
         if (path / "meta.json").is_file():
@@ -108,6 +111,7 @@ def ledger(
                     f"{recording}: its recording is not at {path}; give the recording's path with -c {run.config_path}"
                 )
         draft = opened(path, settings)
+        problem = draft.problem
         settings = draft.config
         recording = draft.source.messages()
     messages = list(recording)
@@ -120,12 +124,12 @@ def ledger(
         {} if corrected == settings else {"clock offsets": corrected}
     )
     if replays.objects is None:
-        return _explained(replays, best=best, runs={})
+        return replace(_explained(replays, best=best, runs={}), problem=problem)
     published = {
         cause: replays.published(replay_in_memory(messages, each))
         for cause, each in runs.items()
     }
-    return _explained(replays, best=best, runs=published)
+    return replace(_explained(replays, best=best, runs=published), problem=problem)
 
 
 def _with_sensors(config: Config, tuned: Config, name: str) -> Config:

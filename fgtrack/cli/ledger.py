@@ -16,6 +16,7 @@ from fgtrack.cli.arguments import (
     TrackMap,
 )
 from fgtrack.cli.show import progress, say, show
+from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_output, new_file
 from fgtrack.show.figures.ledger import waterfall
 from fgtrack.show.figures.style import png
@@ -64,3 +65,5 @@ def ledger(
     if not as_json:
         say("")
         say(result.sentence)
+    if result.problem is not None:
+        raise DataError(f"{recording}: {result.problem}")

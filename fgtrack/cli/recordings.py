@@ -24,7 +24,7 @@ from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.shipped import Kind, shipped, summary
 from fgtrack.config.yaml_file import dump, load
-from fgtrack.core.errors import CallError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.output import check_no_overlap
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
@@ -83,7 +83,8 @@ def convert(
     check_recording(out, overwrite)
     from fgtrack.meaning.draft import opened
 
-    source = opened(recording, config).source
+    draft = opened(recording, config)
+    source = draft.source
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
         messages = source.messages()
@@ -101,6 +102,8 @@ def convert(
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")
     for line in excluded_lines({"left_out": unread}):
         say(line)
+    if draft.problem is not None:
+        raise DataError(f"{recording}: {draft.problem}")
 
 
 def _with_unread(

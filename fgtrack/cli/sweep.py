@@ -80,6 +80,8 @@ def sweep(
         raise DataError(
             f"{out / ERROR_TABLE}: {len(result.errors)} cells failed, the first: {result.errors[0]}"
         )
+    if result.problems:
+        raise DataError("; ".join(result.problems))
     # With --input, the sweep's metrics were chosen for another recording.
     if result.unknown_metrics and recording is None:
         raise DataError(

@@ -62,7 +62,7 @@ def tune(
     check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     check_no_overlap(out, [*recordings, config_file])
-    sources, config = opened_together(recordings, config)
+    sources, config, problems = opened_together(recordings, config)
     with progress("tune") as tell:
         report = tune_sources(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     shown = {"parameters": _parameters(report.parameters)}
@@ -81,6 +81,8 @@ def tune(
     if report.broken:
         problem = next(iter(report.broken.values()))
         raise DataError(f"{problem}; the messages before are used")
+    if problems:
+        raise DataError("; ".join(problems))
 
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:

@@ -186,17 +186,21 @@ def opened(recording: Path | str, config: Config | None = None) -> Draft:
 
 def opened_together(
     recordings: Iterable[Path | str], config: Config
-) -> tuple[dict[str, InputSource], Config]:
+) -> tuple[dict[str, InputSource], Config, tuple[str, ...]]:
     """Open several recordings of one vehicle by name; the first one decides the settings for all.
 
-    Returns the sources by path, and the settings. Raises the exceptions of `open_input`.
+    Returns the sources by path, the settings, and a line for each recording with open
+    questions. Raises the exceptions of `open_input`.
     """
     sources: dict[str, InputSource] = {}
+    problems: list[str] = []
     for path in recordings:
         draft = opened(path, config)
         config = draft.config if not sources else config
         sources[str(path)] = draft.source
-    return sources, config
+        if draft.problem is not None:
+            problems.append(f"{path}: {draft.problem}")
+    return sources, config, tuple(problems)
 
 
 def _is_unmapped(config: InputConfig) -> bool:

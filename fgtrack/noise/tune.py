@@ -1,6 +1,7 @@
 """Fit of process and measurement noise to recordings without truth, by maximum likelihood of the innovations."""
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, compress
@@ -74,13 +75,16 @@ def tune(
     `keep` stay as configured: `["motion.std_per_s.speed"]`.
 
     Raises `CallError` for an invalid configuration. Raises `DataError` if a recording
-    cannot be read, a sensor has no model, or nothing can be fitted.
+    cannot be read, a sensor has no model, or nothing can be fitted. Warns of sensors
+    with an open question, which are left out.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # `opened` reports an invalid path
     if isinstance(recordings, Sequence) and not isinstance(recordings, str):
         paths = recordings
-    sources, resolved = opened_together(paths, resolved)
+    sources, resolved, problems = opened_together(paths, resolved)
+    for line in problems:
+        warnings.warn(line, stacklevel=2)
     return tune_sources(sources, resolved, TuneRules(keep=tuple(keep)))
 
 

@@ -65,6 +65,8 @@ class Cell:
     """Wall times by column."""
     error: str | None = None
     """Reason on one line if there is no result, else None."""
+    problem: str | None = None
+    """Line on open questions about the recording, whose sensors are left out; None without such questions."""
 
 
 _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="forbid"))
@@ -80,6 +82,8 @@ class SweepResult:
     """Reasons of the failed cells."""
     unknown_metrics: tuple[str, ...]
     """Metrics of the plan that match no column."""
+    problems: tuple[str, ...] = ()
+    """Lines on open questions about recordings."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +220,7 @@ def write_tables(
         len(good),
         tuple(str(cell.error) for _, cell in rows if cell.error is not None),
         unknown,
+        tuple(dict.fromkeys(cell.problem for _, cell in rows if cell.problem)),
     )
 
 
@@ -231,6 +236,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
     try:
         config = validate(Config, recipe["config"], "config")
         rng = np.random.default_rng(recipe["seed"])
+        problem = None
         if recipe["recording"] is None:
             messages = simulated(
                 validate(Scenario, recipe["scenario"], "scenario"), rng
@@ -238,6 +244,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         else:
             draft = opened(recipe["recording"], config)
             source = draft.source
+            problem = draft.problem
             delays = validate(dict[str, SensorDelays], recipe["delays"], "delays")
             messages = list(
                 redelay(source.messages(), delays, rng)[0]
@@ -252,7 +259,9 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
             Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]
         ]
     return key, [
-        _cell(messages, replace(config, estimator=name), score)
+        replace(
+            _cell(messages, replace(config, estimator=name), score), problem=problem
+        )
         for name in recipe["estimators"]
     ]
 

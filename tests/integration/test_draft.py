@@ -5,6 +5,7 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from fgtrack.meaning import evidence
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.draft import drafted
 from fgtrack.models.sensors import Mount
+from fgtrack.pipeline.sweep import run_job
+from fgtrack.pipeline.sweep import write_tables as write_tables_of_sweep
 
 CARS_M = ((20.0, 3.5, 1.0), (35.0, -3.0, -2.0), (50.0, 0.5, 0.5))
 """Place ahead and to the left at the start, and speed relative to the ego."""
@@ -322,6 +325,55 @@ def test_replay_and_info_exit_with_1_while_a_question_is_open(
         warnings.simplefilter("always")
         fgtrack.replay(tables)
     assert any("left out of the runs" in str(each.message) for each in caught)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("convert", "out.jsonl"),
+        pytest.param(("ledger",), marks=pytest.mark.slow),
+        pytest.param(("tune", "-o", "tuned.yaml"), marks=pytest.mark.slow),
+    ],
+)
+def test_other_commands_exit_with_1_while_a_question_is_open(
+    words, tables, tests, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    tests(asks_for_the_mount)
+    assert command([words[0], str(tables), *words[1:]]) == 1
+    shown = capsys.readouterr()
+    assert "lidar_rear left out of the runs" in shown.err
+    assert "Set sensors.lidar_rear.mount" in shown.err
+
+
+def test_a_sweep_names_the_open_questions(tables, tests, tmp_path):
+    tests(asks_for_the_mount)
+    recipe = {
+        "config": {},
+        "recording": str(tables),
+        "scenario": None,
+        "delays": {},
+        "seed": 0,
+        "estimators": ["ekf-replay"],
+    }
+    key, cells = run_job("job", recipe, lambda run: ({"lists": 1}, {}))
+    assert [cell.error for cell in cells] == [None]
+    assert "Set sensors.lidar_rear.mount" in str(cells[0].problem)
+    plan = SimpleNamespace(
+        jobs=[SimpleNamespace(key=key, recipe=recipe, cells=(), seed=0)],
+        metrics=(),
+        columns=(),
+        estimators=["ekf-replay"],
+    )
+    result = write_tables_of_sweep(tmp_path, plan, {key: cells})
+    assert result.problems == (cells[0].problem,)
+
+
+def test_advised_settings_do_not_ignore_a_sensor_with_an_open_question(tables, tests):
+    tests(asks_for_the_mount)
+    advice = fgtrack.advise(tables)
+    assert "lidar_rear" not in advice.config.ignore_sensors
+    assert any("Set sensors.lidar_rear.mount" in each.text for each in advice.findings)
 
 
 def test_a_draft_in_python_has_the_settings_of_the_replay(tables, tests):
