@@ -96,6 +96,21 @@ def test_a_report_of_an_aircraft_has_both_times_identity_and_accuracy(tmp_path):
     assert (second.stamp_ns, second.receipt_ns) == (99_500_000_000, 101_000_000_000)
 
 
+#: 95 % radii of NACp 1 to 8 in nautical miles, and of 9 to 11 in metres, as the categories are defined.
+NAUTICAL = (10.0, 4.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05)
+RADII_M = [*(1852.0 * each for each in NAUTICAL), 30.0, 10.0, 3.0]
+
+
+@pytest.mark.parametrize(("nacp", "radius_m"), [*enumerate(RADII_M, start=1)])
+def test_an_accuracy_category_is_a_radius_with_a_probability_of_95_percent(
+    nacp, radius_m, tmp_path
+):
+    (tmp_path / "a.ast").write_bytes(aircraft(100.5, 100.75, 41.31, 2.08, nacp=nacp))
+    (one,) = lists(tmp_path / "a.ast", origin=AIRPORT)
+    std_m = radius_m / math.sqrt(-2.0 * math.log(0.05))
+    assert math.sqrt(one.objects[0].covariance[0]) == pytest.approx(std_m, rel=1e-4)
+
+
 def test_the_items_of_the_times_are_settings(tmp_path):
     (tmp_path / "a.ast").write_bytes(aircraft(100.5, 100.75, 41.31, 2.08))
     (one,) = lists(

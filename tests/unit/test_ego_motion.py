@@ -103,6 +103,18 @@ def test_noise_at_rest_turns_no_heading():
     assert abs(np.mean([each.speed_mps for each in found[40:]])) < 0.05
 
 
+def test_a_high_rate_of_noisy_positions_makes_no_noisier_heading():
+    """The turn is taken from courses that lie apart: 2 cm at 100 Hz are 2 rad/s between neighbouring courses."""
+    rng = np.random.default_rng(0)
+    motion = EgoMotion(missing_motion(("x_m", "y_m")))
+    yaws_rad = []
+    for k, (dx_m, dy_m) in enumerate(rng.normal(0.0, 0.02, (600, 2)).tolist()):
+        stamp_ns = k * 10_000_000
+        given = EgoState(stamp_ns, stamp_ns, 0.1 * k + dx_m, dy_m, math.nan, math.nan)
+        yaws_rad.append(motion.completed(given).yaw_rad)
+    assert np.std(yaws_rad[200:]) < 0.04
+
+
 def test_nothing_is_computed_if_heading_and_speed_are_measured():
     assert missing_motion(("x_m", "y_m", "yaw_rad", "speed_mps")) == ()
     state = circle()[3]

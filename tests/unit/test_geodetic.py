@@ -12,7 +12,7 @@ from pymap3d import vincenty
 
 from fgtrack.cli.main import run as command
 from fgtrack.config.yaml_file import validate
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
 from fgtrack.inputs.formats.fields import objects_by_fields
 from fgtrack.inputs.geodetic import LocalPlane, latitudes_longitudes_deg
@@ -304,3 +304,18 @@ def test_map_panels_get_fixes(tmp_path):
     assert "latitude: 41.3100" in repr(topics["/tracks/fixes"]) or "41.3" in repr(
         topics["/tracks/fixes"]
     )
+
+
+def of_origin(latitude_deg: float, longitude_deg: float) -> InputConfig:
+    origin = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
+    return validate(InputConfig, {"origin": origin}, "c.yaml")
+
+
+@pytest.mark.parametrize(
+    "wrong", [(-90.1, 0.0), (90.1, 0.0), (0.0, -180.1), (0.0, 180.1)]
+)
+def test_an_origin_lies_on_earth(wrong: tuple[float, float]) -> None:
+    assert of_origin(-90.0, 180.0).origin == Origin(-90.0, 180.0)
+    assert of_origin(90.0, -180.0).origin == Origin(90.0, -180.0)
+    with pytest.raises(CallError, match="itude_deg"):
+        of_origin(*wrong)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,8 +25,9 @@ from fgtrack.noise.likelihood import contaminated
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
 from fgtrack.noise.likelihood.reference import filtered, with_mixed_marked
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
-from fgtrack.noise.measurements import observation
+from fgtrack.noise.measurements import _WideGate, observation
 from fgtrack.noise.parameters import ConfigNoise
+from fgtrack.noise.tune import _REJECTED, _Tuning
 
 START = Start(
     position_m=(3.0, -2.0),
@@ -429,3 +431,26 @@ def test_noise_that_grows_with_range_is_not_laid_to_the_standard_deviations() ->
     assert observation(
         "lidar", sensor, measurement, own=False
     ).other_errors == pytest.approx(grown)
+
+
+def test_a_limit_is_the_last_value_that_the_data_do_not_reject() -> None:
+    """The log-likelihood falls by the squared logarithm from its maximum at 1."""
+    fit = _Tuning.__new__(_Tuning)
+    likelihood = SimpleNamespace(totals=lambda rows: -(np.log(rows[:, 1]) ** 2))
+    values = np.array([7.0, 1.0])
+    reach = math.exp(math.sqrt(_REJECTED))
+    for configured, nearest in ((100.0, reach), (1e-2, 1.0 / reach), (2.0, 2.0)):
+        fit._configured = np.array([7.0, configured])
+        limit = fit._limit(likelihood, values, 1)
+        assert limit == pytest.approx(nearest, rel=0.12)
+        assert np.log(limit) ** 2 <= _REJECTED
+
+
+def test_a_bearing_is_as_uncertain_across_as_the_track_is_far_from_the_sensor() -> None:
+    bearing = Measurement.of(
+        0, std=0.02, pose=SensorPose(1.0, 2.0, 0.5), bearing_rad=0.3
+    )
+    candidate = SimpleNamespace(position_covariance=None, measurement=bearing)
+    means = np.array([[4.0, 6.0, 0.0, 0.0], [1.0, -8.0, 0.0, 0.0]])
+    stds_m = _WideGate(None, 4.0)._stds_m(candidate, means)
+    assert stds_m.tolist() == pytest.approx([0.02 * 5.0, 0.02 * 10.0])
