@@ -45,6 +45,7 @@ _HOMES = {
     "Mounts": "fgtrack.meaning.mounts",
     "NS_PER_S": "fgtrack.core.time",
     "ObjectList": "fgtrack.inputs.formats.common",
+    "Ranking": "fgtrack.ranking.result",
     "RobustLoss": "fgtrack.models.sensors",
     "Run": "fgtrack.runs",
     "ScheduledMeasurement": "fgtrack.evaluation.bounds",
@@ -94,6 +95,7 @@ _HOMES = {
     "nanoseconds": "fgtrack.core.time",
     "open_input": "fgtrack.inputs.source",
     "plot": "fgtrack.show.figures",
+    "rank": "fgtrack.ranking.public",
     "read_scenario": "fgtrack.config.reading",
     "replay": "fgtrack.pipeline.public",
     "robust_weight": "fgtrack.estimation.filters.ekf",
@@ -207,6 +209,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
     from fgtrack.pipeline.scored_sweep import sweep as sweep
+    from fgtrack.ranking.public import rank as rank
+    from fgtrack.ranking.result import Ranking as Ranking
     from fgtrack.recording_study import Study as Study
     from fgtrack.recording_study import study as study
     from fgtrack.runs import Run as Run

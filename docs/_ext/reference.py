@@ -11,6 +11,7 @@ from typing import Any, get_args, get_origin
 
 from fgtrack.config.keys import one_line, settings_page
 
+
 def estimators_page() -> str:
     """A table of all estimators that come with fgtrack."""
     from fgtrack.estimation.registry import ESTIMATORS, Claims
@@ -42,7 +43,7 @@ def motion_models_page() -> str:
 
 _GROUPS = {
     "Recordings, runs, live use": ("inputs", "meaning", "runs", "pipeline", "config", "sim"),
-    "Evaluation, figures, reports": ("evaluation", "show", "recording_study"),
+    "Evaluation, figures, reports": ("evaluation", "ranking", "show", "recording_study"),
     "Advice and noise": ("advice", "noise", "clocks"),
     "Messages, reports, errors": ("core",),
     "Estimators": ("estimation", "testing"),

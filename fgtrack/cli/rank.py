@@ -91,10 +91,7 @@ def _write(out: Path, found: Ranking, names: list[str], overwrite: bool) -> None
             json.dumps(tables.to_dict(), indent=2), encoding="utf-8"
         )
         for name in names:
-            lines = [f"# {name}", "", *(f"- {line}" for line in found.sentences(name))]
-            (folder / f"{name}.md").write_text(
-                "\n".join(lines) + "\n", encoding="utf-8"
-            )
+            (folder / f"{name}.md").write_text(found.page(name), encoding="utf-8")
 
 
 def _outputs(out: Path | None, names: list[str]) -> list[Path]:

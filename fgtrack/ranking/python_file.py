@@ -224,7 +224,7 @@ def python_file(path: Path, wanted: str = "") -> PythonMethod:
             raise CallError(
                 f"{path}: {wanted}: is no method: {', '.join(own) or 'the file holds none'}"
             )
-        return PythonMethod(wanted, own[wanted])
+        return PythonMethod(f"{path.stem}.{wanted}", own[wanted])
     if not own:
         raise CallError(
             f"{path}: define a class with update(observation) and state_at(time_s) or tracks_at(time_s), "

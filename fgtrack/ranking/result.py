@@ -92,7 +92,7 @@ class Result:
             parts.append("the order of arrival does not matter")
         elif math.isfinite(self.order):
             parts.append(
-                f"another order of arrival changes it by {self.order:.2g} standard deviations"
+                f"another order of arrival changes an estimate by {self.order:.2g} standard deviations"
             )
         anees = average(self.nees)
         if anees.is_known and anees.low > _NUM_STATES:
@@ -113,12 +113,12 @@ class Result:
 
 def _departure(lag_s: float, deviation: float) -> str:
     """Return the departure from the exact estimate at a lag in words."""
-    when = f"{lag_s:g} s ago" if lag_s else "now"
+    name = f"estimate {lag_s:g} s ago" if lag_s else "present estimate"
     if math.isnan(deviation):
-        return f"{when} no answer"
+        return f"there is no {name}"
     if deviation < EXACT:
-        return f"{when} exact"
-    return f"{when} up to {deviation:.2g} standard deviations off"
+        return f"the {name} is exact"
+    return f"the {name} departs by up to {deviation:.2g} standard deviations"
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,64 @@ class Ranking:
     def __str__(self) -> str:
         return str(self.tables)
 
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods in the order of the call."""
+        return tuple(dict.fromkeys(each.method for each in self.results))
+
     def sentences(self, method: str) -> list[str]:
         """Return a sentence for each scenario on where, and by how much, `method` departs from the exact estimate."""
         return [each.sentence for each in self.results if each.method == method]
+
+    def summary(self, method: str) -> str:
+        """Return a sentence on the departure of `method` over the scenarios of one object."""
+        own = [
+            each
+            for each in self.results
+            if isinstance(each, Result)
+            and each.method == method
+            and each.problem is None
+        ]
+        if not own:
+            return "there are no answers about one object"
+        exact = [each for each in own if each.deviation < EXACT]
+        text = f"the present estimate is exact in {len(exact)} of {len(own)} scenarios of one object"
+        farthest = max(own, key=lambda each: np.nan_to_num(each.deviation, nan=-1.0))
+        if farthest.deviation >= EXACT:
+            text += (
+                f"; it departs most in {farthest.scenario}, "
+                f"by {farthest.deviation:.2g} standard deviations"
+            )
+        return text
+
+    def page(self, method: str) -> str:
+        """Return the page of `method` as Markdown: a summary, and a sentence for each scenario."""
+        lines = [f"# {method}", "", _as_sentences(self.summary(method)), ""]
+        for sentence in self.sentences(method):
+            scenario, text = sentence.split(": ", 1)
+            lines.append(f"- `{scenario}`: {_as_sentences(text)}")
+        return "\n".join([*lines, ""])
+
+    def deviations(self) -> Table:
+        """Return the present deviation of each method in each scenario of one object, the most exact method first."""
+        one = [each for each in self.results if isinstance(each, Result)]
+        scenarios = list(dict.fromkeys(each.scenario for each in one))
+        records: dict[str, dict[str, object]] = {}
+        for each in one:
+            record = records.setdefault(each.method, {"method": each.method})
+            record[each.scenario] = each.deviation
+        columns = [
+            Column("method", left=True),
+            *(Column(name, text=_scientific) for name in scenarios),
+        ]
+        note = (
+            "largest deviation of the present x, y, vx, vy from the exact joint estimate, in its standard deviations; "
+            f"{self.num_runs} runs; a dash: no result"
+        )
+        ordered = sorted(records.values(), key=lambda record: _farthest(record))
+        return Table(
+            "deviation from the exact estimate", ordered, columns, ("method",), [note]
+        )
 
     def _table(self, scenario: str) -> Table:
         own = [each for each in self.results if each.scenario == scenario]
@@ -201,6 +256,17 @@ def _record(result: Result) -> dict[str, object]:
         record[f"error_{k}_m"] = _mean(result.rmse_m[:, k].tolist())
         record[f"deviation_{k}"] = float(result.deviations[:, k].max())
     return record
+
+
+def _as_sentences(text: str) -> str:
+    """Return clauses that semicolons divide as sentences."""
+    return " ".join(f"{each[0].upper()}{each[1:]}." for each in text.split("; "))
+
+
+def _farthest(record: Mapping[str, object]) -> float:
+    """Return the largest deviation in a record; a missing deviation counts as infinite."""
+    values = [value for value in record.values() if isinstance(value, float)]
+    return max(math.inf if math.isnan(value) else value for value in values)
 
 
 def _scientific(value: str | int | float) -> str:

@@ -53,6 +53,12 @@ SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
     ),
     "ladder": ({"runs": 2, "lags": "1,4"}, {}, "ladder.csv", 0),
     "lag": ({"runs": 4}, {}, "lag.csv", 0),
+    "leaderboard": (
+        {"runs": 2},
+        {"SCENARIOS": ("late-by-1", "late-by-10"), "OTHERS": ()},
+        "leaderboard.csv",
+        5,
+    ),
     "outliers": ({"runs": 2}, {"NUM_STEPS": 5}, "outliers.csv", 0),
     "rivals": (
         {"seeds": 1, "duration_s": 4.0, "scenes": "default, fitted noise"},

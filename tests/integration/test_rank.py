@@ -24,7 +24,7 @@ from fgtrack.ranking.scenarios import SCENARIOS, draw
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "rank.md").read_text(encoding="utf-8")
-(ADAPTER,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+ADAPTER, IN_PYTHON = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 #: A Kalman filter that sorts all known measurements by their stamps.
 SORTED = """
@@ -84,7 +84,10 @@ def test_exact_methods_are_named_exact(scenario: str) -> None:
     result = rank("smoother-banded", scenario)
     assert result.deviations.max() < EXACT
     assert result.order < EXACT
-    assert "now exact; 0.3 s ago exact; 1 s ago exact" in result.sentence
+    assert (
+        "present estimate is exact; the estimate 0.3 s ago is exact; the estimate 1 s"
+        in result.sentence
+    )
     assert "the order of arrival does not matter" in result.sentence
 
 
@@ -98,7 +101,7 @@ def test_late_data_that_count_as_present_are_named() -> None:
     result = rank("as-current", num_runs=3)
     assert result.deviation > 1.0
     assert result.order > 1.0
-    assert "another order of arrival changes it" in result.sentence
+    assert "another order of arrival changes an estimate" in result.sentence
 
 
 @pytest.mark.parametrize(
@@ -121,6 +124,29 @@ def test_the_adapter_of_the_page_runs_and_departs(tmp_path: Path) -> None:
     result = rank(path)
     assert result.problem is None
     assert result.deviation > 1.0
+
+
+def test_the_adapter_of_the_page_is_short() -> None:
+    code = [line for line in ADAPTER.splitlines() if line.strip()]
+    assert len(code) <= 15
+
+
+def test_the_page_ranks_in_python(capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(IN_PYTHON, "rank.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "# drop" in printed
+    assert "It departs most in late-by-3, by" in printed
+    assert "measurements not fused" in printed
+
+
+def test_a_table_holds_the_deviations_of_all_methods_the_exact_first() -> None:
+    found = ranked(["drop", "ekf-replay"], ["late-by-3", "late-by-10"], num_runs=2)
+    table = found.deviations()
+    assert [record["method"] for record in table.records] == ["ekf-replay", "drop"]
+    assert found.summary("ekf-replay") == (
+        "the present estimate is exact in 2 of 2 scenarios of one object"
+    )
+    assert "ekf-replay" in table.to_latex()
 
 
 def test_a_function_that_sorts_is_exact_now(tmp_path: Path) -> None:
@@ -148,7 +174,10 @@ def test_a_sabotaged_copy_of_an_exact_method_is_named_by_its_deviation(
     path = written(tmp_path / "copy.py", text.replace(exact, sabotage))
     result = rank(path)
     assert result.deviation > 1e-3
-    assert re.search(r"now up to [0-9.e-]+ standard deviations off", result.sentence)
+    assert re.search(
+        r"present estimate departs by up to [0-9.e-]+ standard deviations",
+        result.sentence,
+    )
 
 
 def test_a_function_that_uses_later_data_is_refused(tmp_path: Path) -> None:
@@ -208,7 +237,7 @@ def test_a_class_of_several_is_named(tmp_path: Path) -> None:
     path = written(tmp_path / "two.py", SHORT + SHORT.replace("One", "Two"))
     with pytest.raises(CallError, match="holds One, Two: name one"):
         method(path)
-    assert method(f"{path}:Two").name == "Two"
+    assert method(f"{path}:Two").name == "two.Two"
     with pytest.raises(CallError, match="Three: is no method: One, Two"):
         method(f"{path}:Three")
 
@@ -314,7 +343,7 @@ def test_the_command_prints_tables_and_writes_a_page_for_each_method(
     words = ["rank", "ekf-replay", "drop", "--scenario", "late-by-10", "--runs", "2"]
     done = CliRunner().invoke(app, [*words, "-o", str(out)])
     assert done.exit_code == 0, done.output
-    assert "now exact" in done.output
+    assert "the present estimate is exact" in done.output
     assert sorted(os.listdir(out)) == [
         "drop.md",
         "ekf-replay.md",
