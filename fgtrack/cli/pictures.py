@@ -1,6 +1,6 @@
 """`fgtrack figure` and `report`: figures of runs and sweeps, and an HTML report of runs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal, cast
@@ -35,7 +35,8 @@ def figure(
         Path, Option("-o", "--out", help="Folder for the figures, or a .pdf file.")
     ],
     form: Annotated[
-        Literal["png", "svg", "pdf"], Option("--format", help="Format of the figures.")
+        Literal["png", "svg", "pdf", "eps"],
+        Option("--format", help="Format of the figures."),
     ] = "png",
     stamp: Annotated[
         float | None,
@@ -50,6 +51,16 @@ def figure(
     ] = None,
     style: Annotated[
         str | None, Option(metavar="FILE", help="Matplotlib style (.mplstyle).")
+    ] = None,
+    log: Annotated[
+        str | None,
+        Option(metavar="AXES", help="Logarithmic axes of a sweep: x, y or xy."),
+    ] = None,
+    legend: Annotated[
+        str | None,
+        Option(
+            metavar="POSITION", help="Legend of a sweep: above, or ends (of the lines)."
+        ),
     ] = None,
     every: Annotated[
         bool, Option("--all", help="Draw all objects, runs and metrics.")
@@ -71,7 +82,13 @@ def figure(
         raise CallError(
             f"{out}: a picture file cannot contain all figures, give a folder or a .pdf"
         )
-    given = {"width": width, "font": font, "style": style}
+    given = {
+        "width": width,
+        "font": font,
+        "style": style,
+        "log": log,
+        "legend": legend,
+    }
     paper = cast(
         Paper, {name: value for name, value in given.items() if value is not None}
     )
@@ -90,7 +107,8 @@ def figure(
             raise CallError(
                 f"{sweeps[0]}: is a sweep, give it alone and without --stamp"
             )
-        named = chain(first, drawn(plans, every, **paper))
+        captions: dict[str, str] = {}
+        named = _with_captions(chain(first, drawn(plans, every, **paper)), captions)
         if one_file:
             with new_file(out, overwrite) as file:
                 save_pages((each for _, each in named), file)
@@ -98,12 +116,25 @@ def figure(
         else:
             with new_files(out, overwrite) as folder:
                 files = [out / file.name for file in save_named(named, folder, form)]
+    if width is not None:
+        for name, caption in captions.items():
+            say(f"caption of {name}: {caption}")
     if missing is not None:
         say(f"no close-up: {missing}")
     for path in files:
         say(path)
     if not every and any(one.is_extra for one in plans):
         say(f"{sum(one.is_extra for one in plans)} more figures with --all")
+
+
+def _with_captions(
+    named: Iterable[tuple[str, Figure]], captions: dict[str, str]
+) -> Iterator[tuple[str, Figure]]:
+    """Yield figures with their names; their captions are added to `captions`."""
+    for name, figure in named:
+        if caption := getattr(figure, "caption", ""):
+            captions[name] = " ".join(caption.split())
+        yield name, figure
 
 
 def _of_runs(

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import count
@@ -78,9 +79,16 @@ def show(
         say(text.removesuffix("\n"))
 
 
-def _logged(what: str, total: int | None) -> Callable[..., None]:
-    """Return a function that counts steps and prints a line at each tenth of `total` to stderr."""
+def _logged(
+    what: str, total: int | None, clock_s: Callable[[], float] = time.monotonic
+) -> Callable[..., None]:
+    """Return a function that counts steps and prints a line at each tenth of `total` to stderr.
+
+    The line holds the time that is left, if the remaining steps take as long as the
+    finished ones.
+    """
     done = count(1)
+    start_s = clock_s()
 
     def moved(text: str = "", share: float | None = None) -> None:
         if total is None or share is not None:
@@ -88,16 +96,30 @@ def _logged(what: str, total: int | None) -> Callable[..., None]:
         number = next(done)
         if number * _LOG_LINES // total > (number - 1) * _LOG_LINES // total:
             line = f"fgtrack: {what}: {number} of {total}"
+            if number < total:
+                left_s = (clock_s() - start_s) * (total - number) / number
+                line += f", about {_duration(left_s)} left"
             print(one_line(line), file=sys.stderr, flush=True)
 
     return moved
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration in words: seconds, minutes, or hours and minutes."""
+    minutes = round(seconds / 60.0)
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    return (
+        f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+    )
 
 
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Show a progress bar during the block, if stderr is a terminal.
 
-    Without a terminal, a line is printed at each tenth of `total` steps, for a log.
+    Without a terminal, a line is printed at each tenth of `total` steps, for a log. Both
+    hold the time that is left.
 
     Yields a function that advances the bar: `moved(text)` by one step, `moved(text,
     share)` to a share from 0 to 1.

@@ -37,6 +37,8 @@ from fgtrack.sim.scenario import Scenario
 Value = Any
 #: Columns of every table of a sweep after the columns of the axes.
 KEY_COLUMNS = ("seed", "estimator")
+#: Column of the axis of recordings.
+RECORDING = "recording"
 #: Key in a group of keys that contains names for the group's values; the names are in the column of the group.
 LABEL = "label"
 #: Most jobs of a sweep; more are probably a mistake in the file.
@@ -74,8 +76,8 @@ class SweepConfig:
     """Estimators, which run on the same streams."""
     scenario: str | None = None
     """Name or file of a scenario; either this or `input` is required."""
-    input: str | None = None
-    """Path of a recording, instead of a scenario."""
+    input: str | tuple[str, ...] | None = None
+    """Path of a recording, instead of a scenario; a list of paths is an axis of the grid, in the column `recording`."""
     delays: str | None = None
     """File with new delays by sensor for the recording (see `fgtrack convert --delays`)."""
     config: str | None = None
@@ -93,6 +95,13 @@ class SweepConfig:
     metrics: tuple[str, ...] = ()
     """Columns of the metrics, where `*` matches any text; empty for all."""
 
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Paths of the recordings; empty for a scenario."""
+        if self.input is None:
+            return ()
+        return (self.input,) if isinstance(self.input, str) else self.input
+
     def __post_init__(self) -> None:
         object.__setattr__(
             self, "estimators", tuple(map(ESTIMATORS.resolve, self.estimators))
@@ -102,7 +111,9 @@ class SweepConfig:
         redelays = self.delays is not None or any(
             key.startswith(f"{DELAYS}.") for keys in changed for key in keys
         )
-        for name, values in (("estimators", self.estimators), ("seeds", self.seeds)):
+        listed = [("estimators", self.estimators), ("seeds", self.seeds)]
+        listed += [("input", self.recordings)] if is_recorded else []
+        for name, values in listed:
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name}: give at least one, and each only once")
         for wrong, text in (
@@ -133,9 +144,10 @@ class SweepConfig:
         ]
         if self.one_at_a_time:
             axes.insert(0, _one_at_a_time(self.one_at_a_time))
-        if (count := math.prod(map(len, axes)) * len(self.seeds)) > _MOST_JOBS:
+        streams = len(self.seeds) * max(len(self.recordings), 1)
+        if (count := math.prod(map(len, axes)) * streams) > _MOST_JOBS:
             raise ValueError(
-                f"vary: {count} combinations of values and seeds, at most {_MOST_JOBS}"
+                f"vary: {count} combinations of values, seeds and recordings, at most {_MOST_JOBS}"
             )
         for points in itertools.product(*axes):
             cells = {
@@ -260,27 +272,36 @@ def load_plan(
         "recording": None,
         "code": code,
     }
-    recorded = None
+    streams: list[tuple[dict[str, Value], _Recorded | None]] = [({}, None)]
     if sweep.input is None:
         base[SCENARIO] = plain(
             read_scenario(str(sweep.scenario), folder, sweep.duration_s)
         )
     else:
         base[DELAYS] = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
-        recorded = _Recorded((folder / sweep.input).resolve())
-        recipe["recording"] = str(recorded.path)
+        is_axis = not isinstance(sweep.input, str)
+        streams = [
+            ({RECORDING: name} if is_axis else {}, _Recorded((folder / name).resolve()))
+            for name in sweep.recordings
+        ]
     base = _with_keys(base, sweep.set, f"{path}: set")
-    points = list(sweep.grid())
+    points = [
+        (Point({**cells, **point.cells}, point.changes), recorded)
+        for cells, recorded in streams
+        for point in sweep.grid()
+    ]
     jobs = tuple(
         job
-        for point in points
+        for point, recorded in points
         for job in _jobs(base, recipe, point, sweep.seeds, recorded)
     )
     if all(job.recipe is None and not job.is_data_bad for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
-    named = (sweep.input, sweep.delays, sweep.config, sweep.scenario)
+    named = (*sweep.recordings, sweep.delays, sweep.config, sweep.scenario)
     inputs = (path, *(folder / name for name in named if name is not None))
-    return Plan(tuple(points[0].cells), jobs, sweep.estimators, sweep.metrics, inputs)
+    return Plan(
+        tuple(points[0][0].cells), jobs, sweep.estimators, sweep.metrics, inputs
+    )
 
 
 class _Recorded:
@@ -356,6 +377,8 @@ def _jobs(
     jobs = []
     for seed in seeds:
         seeded = {**recipe, **values, **read, "seed": seed}
+        if recorded is not None:
+            seeded["recording"] = str(recorded.path)
         content = json.dumps({**seeded, "recording": None}, sort_keys=True)
         jobs.append(Job(cells, seed, _sha256(content.encode())[:32], seeded))
     return jobs

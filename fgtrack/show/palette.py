@@ -34,6 +34,7 @@ _ESTIMATORS: Mapping[str, CurveStyle] = {
     "smoother-batch": CurveStyle(_BLUE, "-.", "o"),
     "smoother-banded": CurveStyle(_BLUE, ":", "o"),
     "ekf-replay": CurveStyle(_ORANGE, "--", "s"),
+    "ekf-rts": CurveStyle(_ORANGE, "-.", "D"),
     "ekf-backward-forward": CurveStyle(_GREEN, "-", "^"),
     "rewind-forget": CurveStyle(_GREEN, "--", "^"),
     "drop": CurveStyle(_RED, "-", "v"),

@@ -160,7 +160,7 @@ def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
     rows = rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5)}, **cells)
     table = difference_table(seed_comparisons(sweep_of(rows)), tuple(cells))
     assert [row[0] for row in table.rows()] == ["much, 5.0", ""]
-    assert table.columns[0].heading == "late,\ngate_m"
+    assert table.columns[0].heading == "late,\nassociation gate [m]"
     assert table.data["standing"].tolist() == ["best", "worse"]
     assert max(map(len, str(table).splitlines())) <= 100
 

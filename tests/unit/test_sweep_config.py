@@ -248,6 +248,34 @@ def test_the_delays_of_a_recording_may_be_varied(plan: Any, recording: str) -> N
     assert [job.seed for job in made.jobs] == [0, 1]
 
 
+def test_recordings_are_an_axis_of_the_grid(
+    plan: Any, recording: str, tmp_path: Path
+) -> None:
+    messages = simulate(read_scenario("default"), np.random.default_rng(1))[:200]
+    write_stream(tmp_path / "other.jsonl", messages)
+    head = recording.replace("drive.jsonl", "[drive.jsonl, other.jsonl]")
+    made = plan(
+        "vary: {evaluation.gate_m: [3.0, 5.0]}",
+        head,
+    )
+    assert made.columns == ("recording", "evaluation.gate_m")
+    assert [job.cells for job in made.jobs] == [
+        ("drive.jsonl", 3.0),
+        ("drive.jsonl", 5.0),
+        ("other.jsonl", 3.0),
+        ("other.jsonl", 5.0),
+    ]
+    read = [Path(job.recipe["recording"]).name for job in made.jobs]
+    assert read == ["drive.jsonl", "drive.jsonl", "other.jsonl", "other.jsonl"]
+    assert len(set(keys(made))) == 4
+    assert {"drive.jsonl", "other.jsonl"} <= {path.name for path in made.inputs}
+    for wrong in ("[]", "[drive.jsonl, drive.jsonl]"):
+        with pytest.raises(
+            CallError, match="input: give at least one, and each only once"
+        ):
+            plan("", recording.replace("drive.jsonl", wrong))
+
+
 # --- keys
 
 

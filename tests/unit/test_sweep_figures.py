@@ -1,17 +1,25 @@
 """Figures of a sweep: means and standard errors of its table, drawn over the grid."""
 
 import csv
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.evaluation.tables.seeds import SWEEP_FILE, read_sweep
+from fgtrack.evaluation.tables.seeds import (
+    SWEEP_FILE,
+    difference_table,
+    read_sweep,
+    seed_comparisons,
+    summary_table,
+)
 from fgtrack.pipeline.sweep import SWEEP_TABLE
 from fgtrack.show.figures import plot
+from fgtrack.show.figures.style import save
 from fgtrack.show.figures.sweep import metric_words
 
 POSITION, NEES = (
@@ -156,7 +164,7 @@ def test_error_against_delay_needs_no_sweep_and_rises_for_every_method() -> None
         "ekf-replay",
         "ekf-backward-forward",
         "drop",
-        "smoother, output 0.3 s later",
+        "smoother, 0.3 s later",
     ]
     assert axes.get_xlabel() == "LiDAR delay, mean [ms]"
     assert len(axes.collections) == len(lines)  # a band each
@@ -164,3 +172,134 @@ def test_error_against_delay_needs_no_sweep_and_rises_for_every_method() -> None
         assert y[-1] > y[1]
     assert (lines["ekf-backward-forward"][1:] > lines["smoother"][1:]).all()
     assert faults(figure) == []
+
+
+SHARE = "truth.overall.tracked_share_in_view"
+
+
+def a_tracked_sweep(folder: Path) -> Path:
+    """Two estimators, three delays, two seeds; the first one tracks less and less of the time."""
+    folder.mkdir()
+    rows = [["delay_s", "seed", "estimator", POSITION, SHARE]]
+    for delay, seed in product(DELAYS, range(2)):
+        tracked = 1.0 - 1.2 * float(delay)
+        rows.append(
+            [delay, str(seed), "drop", str(float(delay) + 0.01 * seed), str(tracked)]
+        )
+        rows.append([delay, str(seed), "ekf-replay", str(0.2 + 0.01 * seed), "1.0"])
+    with (folder / SWEEP_FILE).open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return folder
+
+
+@pytest.mark.parametrize("draw", [plot.sweep, plot.error_against_delay])
+def test_the_share_of_the_time_that_is_tracked_stands_beside_a_low_error(
+    draw: Any, tmp_path: Path
+) -> None:
+    figure = draw(a_tracked_sweep(tmp_path / "sweep"), width="3.4in")
+    [axes] = figure.axes
+    texts = [text.get_text() for text in axes.texts]
+    assert texts == [
+        "94 %",
+        "88 %",
+        "76 %",
+    ]  # not the estimator that tracks all the time
+    assert "mean over 2 seeds" in figure.caption
+    assert "95 % interval" in figure.caption
+    assert "numbers: share of the time tracked [%]" in figure.caption
+    assert faults(figure) == []
+
+
+def test_axes_are_logarithmic_where_the_user_says_so(tmp_path: Path) -> None:
+    folder = a_tracked_sweep(tmp_path / "sweep")
+    scales = {
+        log: plot.sweep(folder, **({"log": log} if log else {})).axes[0]
+        for log in (None, "x", "y", "xy")
+    }
+    found = {
+        log: (axes.get_xscale(), axes.get_yscale()) for log, axes in scales.items()
+    }
+    assert found == {
+        None: ("linear", "linear"),
+        "x": ("log", "linear"),
+        "y": ("linear", "log"),
+        "xy": ("log", "log"),
+    }
+    with pytest.raises(CallError, match="log 'z': must be one of x, y, xy"):
+        plot.sweep(folder, log="z")
+
+
+def test_labels_at_the_ends_of_lines_do_not_overlap(tmp_path: Path) -> None:
+    folder = a_sweep(tmp_path / "sweep", estimators=6)
+    figure = plot.sweep(folder, width="3.4in", legend="ends")
+    figure.draw_without_rendering()
+    [axes] = figure.axes
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert [text.get_text() for text in axes.texts].count("estimator-3") == 1
+    assert len(boxes) == 6
+    assert axes.get_legend() is None
+    boxes.sort(key=lambda box: box.y0)
+    assert all(low.y1 <= high.y0 + 1.0 for low, high in pairwise(boxes))
+    assert all(box.x1 <= figure.bbox.width + 1.0 for box in boxes)
+
+
+def test_a_legend_above_a_narrow_figure_has_columns(tmp_path: Path) -> None:
+    figure = plot.sweep(a_sweep(tmp_path / "sweep", estimators=4), width="3.4in")
+    legend = figure.axes[0].get_legend()
+    assert legend._ncols == 3
+    figure.draw_without_rendering()
+    assert legend.get_window_extent().x1 <= figure.bbox.width
+
+
+@pytest.mark.parametrize("form", ["pdf", "eps"])
+def test_fonts_are_truetype_and_equal_figures_give_equal_bytes(
+    form: str, tmp_path: Path
+) -> None:
+    folder = a_tracked_sweep(tmp_path / "sweep")
+    contents = [
+        save(
+            plot.error_against_delay(folder, width="3.4in"), tmp_path / f"{k}.{form}"
+        ).read_bytes()
+        for k in range(2)
+    ]
+    assert contents[0] == contents[1]
+    assert b"/Type3" not in contents[0]
+    assert b"/FontType 3" not in contents[0]
+    assert b"/FontType 42" in contents[0] or b"/CIDFontType2" in contents[0]
+
+
+def test_a_table_for_latex_has_words_intervals_and_seeds(tmp_path: Path) -> None:
+    sweep = read_sweep(a_tracked_sweep(tmp_path / "sweep"))
+    summary = summary_table(sweep).to_latex()
+    assert (
+        "Mean over 2 seeds, $\\pm$: half of the 95 \\% interval of the mean (t)"
+        in summary
+    )
+    assert "delay [s] & estimator & position RMSE [m] & tracked [\\%]" in summary
+    differences = difference_table(seed_comparisons(sweep), sweep.axes).to_latex()
+    assert (
+        "\\caption{position RMSE [m]. Intervals: t intervals of paired" in differences
+    )
+    assert "truth" not in summary + differences
+
+
+def test_a_consistency_alone_names_no_best_estimator(tmp_path: Path) -> None:
+    rows = [
+        [
+            "delay_s",
+            "seed",
+            "estimator",
+            "consistency.nis.radar.mean",
+            "consistency.nis.radar.dof",
+        ]
+    ]
+    rows += [
+        ["0.1", str(seed), name, "2.5", "2.0"]
+        for seed in range(3)
+        for name in ("a", "b")
+    ]
+    (tmp_path / "sweep.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+    sweep = read_sweep(tmp_path)
+    table = difference_table(seed_comparisons(sweep), sweep.axes)
+    assert table.records
+    assert not any(map(table.is_main, table.records))

@@ -222,7 +222,8 @@ class Table:
         )
 
     def to_latex(self) -> str:
-        """Return a LaTeX table environment with the rules of the package booktabs; notes become comments."""
+        """Return a LaTeX table environment with the rules of the package booktabs; notes are in the caption."""
+        caption = ". ".join([self.title, *(_sentence(note) for note in self.notes)])
         rows = [
             f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")
         ]
@@ -231,7 +232,7 @@ class Table:
                 *(
                     r"\begin{table}",
                     r"\centering",
-                    f"\\caption{{{_latex(self.title)}}}",
+                    f"\\caption{{{_latex(caption)}}}",
                 ),
                 f"\\begin{{tabular}}{{{''.join('l' if column.left else 'r' for column in self.shown)}}}",
                 *(
@@ -239,8 +240,7 @@ class Table:
                     f"{' & '.join(_latex(column.line) for column in self.shown)} \\\\",
                     r"\midrule",
                 ),
-                *(*rows, r"\bottomrule", r"\end{tabular}"),
-                *(*(f"% {printable(note)}" for note in self.notes), r"\end{table}", ""),
+                *(*rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""),
             ]
         )
 
@@ -439,6 +439,11 @@ def _csv(records: Sequence[Record]) -> str:
 def _markdown(text: str) -> str:
     """Return `text` with all characters escaped that Markdown or HTML would interpret."""
     return printable(text).translate(_MARKDOWN).replace("](", r"]\(")
+
+
+def _sentence(note: str) -> str:
+    """Return `note` with a capital first letter, unless it begins with a name in code."""
+    return note if note[:1] == "`" else note[:1].upper() + note[1:]
 
 
 def _latex(text: str) -> str:

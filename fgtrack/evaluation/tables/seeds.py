@@ -23,7 +23,7 @@ from fgtrack.evaluation.comparison import (
 )
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
-from fgtrack.evaluation.tables.metric_names import metric_words
+from fgtrack.evaluation.tables.metric_names import metric_words, words
 
 SWEEP_FILE = "sweep.csv"
 # Width of a heading, and quantile of a two-sided 95 % interval.
@@ -50,8 +50,8 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
 }
 #: Headings of the metrics that a summary shows first.
 _MAIN: Mapping[str, str] = {
-    "truth.overall.errors.position_m.rmse": "pos.\n[m]",
-    "consistency.position_nees.mean": "NEES\npos.",
+    "truth.overall.errors.position_m.rmse": "position\nRMSE [m]",
+    "consistency.position_nees.mean": "position\nNEES",
     "multi_object.gospa.in_view_rms_m": "GOSPA\n[m]",
     "truth.overall.tracked_share_in_view": "tracked\n[%]",
 }
@@ -220,7 +220,10 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
         for item in compared
         for entry in item.entries
     ]
-    first = compared[0].metric if compared else ""
+    # Consistency is no error, so it gives no best estimator.
+    first = next(
+        (one.metric for one in compared if _better(one.metric) != "nearer"), ""
+    )
     keys = (*axes, "metric", "estimator")
     points = pd.DataFrame([item.point for item in compared], columns=list(axes))
     columns = [
@@ -229,9 +232,9 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
         *entry_columns("mean", "mean"),
         Column("seeds"),
     ]
-    notes = ["t intervals of paired differences over seeds", STANDING_NOTE]
+    notes = ["intervals: t intervals of paired differences over seeds", STANDING_NOTE]
     return Table(
-        first,
+        metric_words(first) if first else "",
         records,
         columns,
         keys,
@@ -275,7 +278,13 @@ def summary_table(sweep: SweepTable) -> Table:
         columns.append(
             Column(heading, both, "{} ± {}", scale, is_extra=name not in main)
         )
-    notes = ["±: half of the 95 % interval of the mean (t) over the seeds"]
+    few, most = int(seeds.min()), int(seeds.max())
+    number = f"{few} to {most}" if few < most else str(most)
+    notes = [
+        f"mean over {number} seeds, ±: half of the 95 % interval of the mean (t)"
+        if most > 1
+        else "one seed, so there is no interval"
+    ]
     return Table(
         "Summary",
         records,
@@ -286,17 +295,22 @@ def summary_table(sweep: SweepTable) -> Table:
 
 
 def _point_column(points: DataFrame) -> Column:
-    """Return a column with the axes that distinguish `points`; its heading is the last parts of their names."""
+    """Return a column with the axes that distinguish `points`; its heading has their names in words."""
     shown = distinguishing(points)
-    heading = ",\n".join(axis.rpartition(".")[2] for axis in shown) or "point"
+    heading = ",\n".join(map(words, shown)) or "point"
     return Column(heading, shown, ", ".join(["{}"] * len(shown)) or "{}", left=True)
+
+
+def _better(metric: str) -> Literal["less", "more", "nearer"]:
+    """Return the better direction of a metric of `_BETTER`."""
+    return next(
+        better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern)
+    )
 
 
 def _cost(rows: DataFrame, metric: str) -> DataFrame:
     """Return the number to minimise: the metric, its negative, or its distance from the expected value."""
-    better = next(
-        better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern)
-    )
+    better = _better(metric)
     if better == "nearer":
         default = 2.0 if "position_nees" in metric else np.nan
         return (

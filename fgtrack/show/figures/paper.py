@@ -69,6 +69,13 @@ _METRIC_COMPATIBLE: Mapping[str, Sequence[str]] = {
 }
 
 
+#: Values of the choices of `Paper`.
+_CHOICES: Mapping[str, Sequence[str]] = {
+    "log": ("x", "y", "xy"),
+    "legend": ("above", "ends"),
+}
+
+
 class Paper(TypedDict, total=False):
     """Keyword arguments of every figure.
 
@@ -82,6 +89,10 @@ class Paper(TypedDict, total=False):
     """Font family, for instance "Times New Roman"."""
     style: str | Path
     """Style of matplotlib: a file (.mplstyle) or the name of a shipped style. It overrides rcParams."""
+    log: str
+    """Axes of a sweep's figures with a logarithmic scale: "x", "y" or "xy". The default is chosen by the values."""
+    legend: str
+    """Position of the legend: "above", in columns above the plot, or "ends", beside the ends of the lines."""
     ax: Axes
     """Axes of another figure to draw into. A figure with several plots subdivides them."""
 
@@ -126,7 +137,7 @@ def settings(
     """Return the rcParams of a figure on `paper`.
 
     The user's own values win over fgtrack's values. The style and font of `paper` win
-    over both. Raises `CallError` for an invalid width, style or font.
+    over both. Raises `CallError` for an invalid width, style, font or choice.
     """
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams
@@ -144,6 +155,11 @@ def settings(
             raise CallError(
                 f"style {paper['style']}: cannot be used ({error}), give an .mplstyle file or a style of matplotlib"
             ) from error
+    for name, choices in _CHOICES.items():
+        if paper.get(name, choices[0]) not in choices:
+            raise CallError(
+                f"{name} {paper[name]!r}: must be one of {', '.join(choices)}"
+            )
     if "font" in paper:
         result["font.family"] = _families(paper["font"])
     return result
@@ -215,7 +231,9 @@ class Sheet:
         return result
 
     def title(self, text: str) -> None:
-        """Write `text` above the figure, wrapped to its width; does nothing for a figure without a title."""
+        """Write `text` above the figure, wrapped to its width; a figure without a title keeps it as its caption."""
+        if isinstance(self.figure, StyledFigure):
+            self.figure.caption = text
         if self.has_title:
             width = max(
                 10,

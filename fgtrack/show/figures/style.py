@@ -2,10 +2,12 @@
 
 import base64
 import io
+import logging
 import math
 import textwrap
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,6 +38,10 @@ _LINE = 1.5
 _MOST_ENTRIES = 12
 # Width of the line before a legend entry and of its margins, in characters.
 _HANDLE = 8
+# The same, and the left edge in the axes, for a figure in a column of a page.
+_NARROW_HANDLE = 6
+_NARROW_LEFT = -0.12
+_NARROW_IN = 5.0
 # Width of the labels of an axis, in inches.
 _BESIDE_IN = 0.6
 # Number of legend lines that fit without a higher figure.
@@ -43,12 +49,15 @@ _FREE_LINES = 2
 # Values within this number of interquartile ranges from the quartiles belong to the bulk.
 _BEYOND = 3.0
 _MARGIN = 0.05
+# Comments of an EPS file that differ from run to run.
+_DATES = (b"%%CreationDate", b"%%Title", b"%%Creator")
 _MARK = "fgtrack figure"
 #: Metadata of files by format: the creator, but no date or version, so that equal figures give equal files.
 FORMATS: Mapping[str, Mapping[str, str | None]] = {
     "png": {"Creator": _MARK, "Software": None},
     "svg": {"Creator": _MARK, "Date": None},
     "pdf": {"Creator": _MARK, "CreationDate": None, "Producer": None},
+    "eps": {"Creator": _MARK},
 }
 
 
@@ -57,6 +66,8 @@ class StyledFigure(Figure):
 
     def __init__(self, figsize: tuple[float, float]) -> None:
         super().__init__(figsize=figsize)
+        self.caption = ""
+        """Caption: what is drawn, over how many seeds, with which interval."""
         self._settings: Any = {
             key: value for key, value in _RC.items() if "backend" not in key
         }
@@ -103,25 +114,27 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
         handles = handles[:_MOST_ENTRIES]
         labels = labels[:_MOST_ENTRIES]
         labels[-1] += f" ... and {more} more"
-    letters = (share * figure.get_figwidth() - _BESIDE_IN) / (
+    is_narrow = share * figure.get_figwidth() < _NARROW_IN
+    handle = _NARROW_HANDLE if is_narrow else _HANDLE
+    beside_in = 0.0 if is_narrow else _BESIDE_IN
+    letters = (share * figure.get_figwidth() - beside_in) / (
         LETTER * size_in("legend.fontsize")
     )
-    width = max(_HANDLE + 10, int(letters))
-    broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
-    columns = max(
-        1, width // (_HANDLE + max(len(line) for lines in broken for line in lines))
-    )
+    width = max(handle + 10, int(letters))
+    broken = [textwrap.wrap(label, width - handle) for label in labels]
+    columns = _columns([handle + max(map(len, lines)) for lines in broken], width)
     axes.legend(
         handles,
         ["\n".join(lines) for lines in broken],
         loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
+        bbox_to_anchor=(_NARROW_LEFT if is_narrow else 0.0, 1.0),
         ncols=columns,
         frameon=False,
         borderaxespad=0.2,
         markerscale=markerscale,
-        columnspacing=1.2,
+        columnspacing=0.8 if is_narrow else 1.2,
         handlelength=1.8,
+        handletextpad=0.4 if is_narrow else None,
     )
     if isinstance(figure, StyledFigure):
         grow(
@@ -129,6 +142,82 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
             "legend.fontsize",
             math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES,
         )
+
+
+def _columns(widths: Sequence[int], width: int) -> int:
+    """Return the largest number of columns in which entries of the given `widths` fit into `width`.
+
+    As in matplotlib, entries fill one column after the other.
+    """
+    for columns in range(len(widths), 1, -1):
+        long, more = divmod(len(widths), columns)
+        sizes = [long + (k < more) for k in range(columns)]
+        starts = [sum(sizes[:k]) for k in range(columns)]
+        parts = [widths[a : a + n] for a, n in zip(starts, sizes, strict=True)]
+        if sum(map(max, parts)) <= width:
+            return columns
+    return 1
+
+
+def legend_at_ends(axes: Axes) -> None:
+    """Write the label of each line beside its right end, in the colour of the line.
+
+    Labels are moved apart so that they do not overlap. A plot whose lines have no values
+    gets no labels.
+    """
+    handles, labels = axes.get_legend_handles_labels()
+    figure = axes.get_figure(root=True)
+    lines = [getattr(handle, "lines", [handle])[0] for handle in handles]
+    ends = [
+        (line, label, float(line.get_xdata()[-1]), float(line.get_ydata()[-1]))
+        for line, label in zip(lines, labels, strict=True)
+        if len(line.get_ydata())
+    ]
+    if not ends or figure is None:
+        return
+    figure.draw_without_rendering()
+    points = axes.transData.transform([(x, y) for _, _, x, y in ends])
+    heights = axes.transAxes.inverted().transform(points)[:, 1]
+    box = axes.get_window_extent()
+    step = _LINE * size_in("legend.fontsize") * figure.dpi / box.height
+    for k, height in zip(
+        np.argsort(heights), _apart(np.sort(heights), step), strict=True
+    ):
+        line, label, _, _ = ends[k]
+        axes.annotate(
+            label,
+            (1.0, height),
+            xycoords="axes fraction",
+            xytext=(4.0, 0.0),
+            textcoords="offset points",
+            va="center",
+            fontsize=72.0 * size_in("legend.fontsize"),
+            color=line.get_color(),
+            annotation_clip=False,
+        )
+
+
+def _apart(heights: FloatArray, step: float) -> FloatArray:
+    """Return ascending `heights`, shape (n,), moved apart to at least `step`, each as little as possible.
+
+    Groups of labels that touch are spread about their common mean.
+    """
+    groups: list[list[float]] = []
+    for height in heights.tolist():
+        groups.append([height])
+        while len(groups) > 1 and _lowest(groups[-1], step) < _lowest(
+            groups[-2], step
+        ) + step * len(groups[-2]):
+            last = groups.pop()
+            groups[-1] += last
+    return np.concatenate(
+        [_lowest(group, step) + step * np.arange(len(group)) for group in groups]
+    )
+
+
+def _lowest(group: Sequence[float], step: float) -> float:
+    """Return the lowest height of a group of labels at distances of `step` about its mean."""
+    return sum(group) / len(group) - step * (len(group) - 1) / 2.0
 
 
 def size_in(name: str) -> float:
@@ -216,6 +305,26 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write `figure` as PNG, SVG or PDF, by the suffix of `path`, without date and version; return `path`."""
-    figure.savefig(path, metadata=dict(FORMATS[path.suffix.removeprefix(".")]))
+    """Write `figure` as PNG, SVG, PDF or EPS, by the suffix of `path`, without date and version; return `path`."""
+    form = path.suffix.removeprefix(".")
+    if form != "eps":
+        figure.savefig(path, metadata=dict(FORMATS[form]))
+        return path
+    content = io.BytesIO()
+    with warnings.catch_warnings(), _without_log("matplotlib.backends.backend_ps"):
+        # PostScript has no transparency; shaded bands become solid.
+        figure.savefig(content, format=form, metadata=dict(FORMATS[form]))
+    lines = content.getvalue().split(b"\n")
+    path.write_bytes(b"\n".join(line for line in lines if not line.startswith(_DATES)))
     return path
+
+
+@contextmanager
+def _without_log(name: str) -> Iterator[None]:
+    """Silence the logger `name`."""
+    logger = logging.getLogger(name)
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before

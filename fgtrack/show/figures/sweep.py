@@ -11,13 +11,15 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import NullLocator
 from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables.metric_names import METRIC_NAMES, metric_words, words
 from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
 from fgtrack.show.figures.paper import Paper, Sheet, styled
-from fgtrack.show.figures.style import legend_above, log_axis
+from fgtrack.show.figures.style import legend_above, legend_at_ends, log_axis, size_in
 from fgtrack.show.palette import style_of, styles
 
 _POSITION = "truth.overall.errors.position_m.rmse"
@@ -38,6 +40,9 @@ _WIDE = 3
 _LOG_FROM = 20.0
 # Shift between the error bars of two estimators, as a share of the axis.
 _DODGE = 0.012
+# Share of the time that a track must cover, so that its error needs no remark.
+_TRACKED = 0.95
+_SHARES = ("truth.overall.tracked_share_in_view", "truth.overall.tracked_share")
 # Largest number of values of the horizontal axis that all have a tick.
 _NAMED_STEPS = 8
 
@@ -60,8 +65,9 @@ def sweep(
     """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
 
     The axis with the most numeric values is horizontal. Each combination of the other
-    axes has a panel. `table` is the sweep or its folder, and `metric` a column of
-    sweep.csv. Raises `CallError` for an unknown sweep or metric, and `DataError` for a
+    axes has a panel. A number beside a mean error is the share of the time that is
+    tracked, in per cent, where it is below 95 %. `table` is the sweep or its folder, and
+    `metric` a column of sweep.csv. Raises `CallError` for an unknown sweep or metric, and `DataError` for a
     metric without values.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
@@ -86,6 +92,8 @@ def sweep(
     sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
     grid = sheet.plots(rows, columns, sharex=True, sharey=True)
     estimators = means["estimator"].unique().tolist()
+    has_shares = False
+    is_log = "x" in paper.get("log", "") and are_numbers[across]
     for axes, (point, panel) in zip(grid.flat, panels, strict=False):
         for k, (estimator, its) in enumerate(
             zip(estimators, styles(estimators), strict=True)
@@ -95,7 +103,11 @@ def sweep(
             )
             at, mean, half = mine[["at", "mean", "half"]].to_numpy().T
             # Shift the error bars, so that they do not hide each other.
-            at += _DODGE * width * (k - (len(estimators) - 1) / 2.0)
+            shift = _DODGE * (k - (len(estimators) - 1) / 2.0)
+            if is_log and at.min() > 0.0:
+                at *= (max(ticks.values()) / min(ticks.values())) ** shift
+            else:
+                at += shift * width
             line = {
                 "color": its.colour,
                 "ls": its.line if are_numbers[across] else "none",
@@ -105,6 +117,7 @@ def sweep(
             axes.errorbar(
                 at, mean, half, capsize=3.0, ms=4, lw=1.2, label=label, **line
             )
+            has_shares |= _write_shares(axes, at, mean, mine["tracked"], its.colour)
         axes.set_title(
             "\n".join(
                 f"{words(name)}: {c}" for name, c in zip(rest, point, strict=True)
@@ -121,22 +134,11 @@ def sweep(
             axes.set_xlabel(words(across))
             axes.tick_params(labelbottom=True)
     first: Axes = grid[0, 0]
-    low = means["mean"].min()
-    high = means["mean"].max()
-    if low > 0.0 and high > _LOG_FROM * low:
-        first.set_yscale("log")
-        log_axis(first.yaxis)
-    elif low >= 0.0:
-        first.set_ylim(0.0, None if high else 1.0)
-    if len(ticks) <= _NAMED_STEPS or not are_numbers[across]:
-        first.set_xticks(list(ticks.values()), list(ticks))
-    first.set_xlim(
-        min(ticks.values()) - 0.08 * width, max(ticks.values()) + 0.08 * width
-    )
+    _set_scales(first, means, ticks, are_numbers[across], paper.get("log"))
     for axes in grid[:, 0]:
         axes.set_ylabel(metric_words(metric))
     if len(panels) == 1:
-        legend_above(first)
+        _write_legend(first, paper)
     else:
         sheet.figure.legend(
             *first.get_legend_handles_labels(),
@@ -144,12 +146,86 @@ def sweep(
             ncols=4,
             frameon=False,
         )
+    sheet.title(
+        f"{metric_words(metric).partition(' [')[0]}: {_over_seeds(means, 'bars')}"
+        f"{_SHARES_NOTE if has_shares else ''}"
+    )
+    return sheet.figure
+
+
+#: Caption of the numbers beside errors.
+_SHARES_NOTE = "; numbers: share of the time tracked [%], where below 95 %"
+
+
+def _over_seeds(means: Any, mark: str) -> str:
+    """Return the caption of a mean over seeds, and of its interval, which is drawn as `mark`."""
     few = means["seeds"].min()
     most = means["seeds"].max()
     number = f"{few} to {most}" if few < most else str(most)
-    bars = f"mean over {number} seeds, bars: 95 % interval" if most > 1 else "one seed"
-    sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
-    return sheet.figure
+    return (
+        f"mean over {number} seeds, {mark}: 95 % interval" if most > 1 else "one seed"
+    )
+
+
+def _set_scales(
+    axes: Axes,
+    means: Any,
+    ticks: Mapping[str, float],
+    is_numeric: bool,
+    log: str | None,
+) -> None:
+    """Set scales, limits and ticks. `log` names the logarithmic axes; None chooses by the values."""
+    low = means["mean"].min()
+    high = means["mean"].max()
+    wide = low > 0.0 and high > _LOG_FROM * low
+    if wide if log is None else "y" in log:
+        axes.set_yscale("log")
+        log_axis(axes.yaxis)
+    elif low >= 0.0:
+        axes.set_ylim(0.0, None if high else 1.0)
+    at = list(ticks.values())
+    if log is not None and "x" in log and is_numeric and min(at) > 0.0:
+        axes.set_xscale("log")
+        margin = (max(at) / min(at)) ** 0.08
+        axes.set_xlim(min(at) / margin, max(at) * margin)
+        axes.xaxis.set_minor_locator(NullLocator())
+    else:
+        width = max(at) - min(at) or 1.0
+        axes.set_xlim(min(at) - 0.08 * width, max(at) + 0.08 * width)
+    if len(ticks) <= _NAMED_STEPS or not is_numeric:
+        axes.set_xticks(at, list(ticks))
+
+
+def _write_legend(axes: Axes, paper: Paper) -> None:
+    """Write the legend above the plot, or at the ends of the lines."""
+    if paper.get("legend") == "ends":
+        legend_at_ends(axes)
+    else:
+        legend_above(axes)
+
+
+def _write_shares(
+    axes: Axes, at: Any, means: Any, shares: Any, colour: str
+) -> bool:  # Any: columns of a DataFrame
+    """Write the share of the time that is tracked beside each error where it is low; return True if there is one."""
+    low = [
+        (x, y, share)
+        for x, y, share in zip(at, means, shares, strict=True)
+        if share < _TRACKED
+    ]
+    for x, y, share in low:
+        axes.annotate(
+            f"{100.0 * share:.0f} %",
+            (x, y),
+            (-3.0, 4.0),
+            textcoords="offset points",
+            ha="right",
+            fontsize=0.85 * 72.0 * size_in("xtick.labelsize"),
+            color=colour,
+            path_effects=[withStroke(linewidth=1.5, foreground="white")],
+            zorder=5.0,
+        )
+    return bool(low)
 
 
 @styled
@@ -176,6 +252,7 @@ def error_against_delay(
         )
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
+    has_shares = False
     for metric, means in curves.items():
         means["ms"] = 1e3 * means[delay].astype(float)
         for name, mine in means.sort_values("ms", kind="stable").groupby(
@@ -183,6 +260,7 @@ def error_against_delay(
         ):
             its = style_of(name)
             later = metric_words(metric).partition(", ")[2]
+            later = later.removeprefix("output ")
             line, marker, label = (
                 (":", ".", f"{name}, {later}")
                 if later
@@ -191,6 +269,10 @@ def error_against_delay(
             low = mine["mean"] - mine["half"]
             high = mine["mean"] + mine["half"]
             axes.fill_between(mine["ms"], low, high, color=its.colour, alpha=0.18, lw=0)
+            if metric == _POSITION:
+                has_shares |= _write_shares(
+                    axes, mine["ms"], mine["mean"], mine["tracked"], its.colour
+                )
             axes.plot(
                 mine["ms"],
                 mine["mean"],
@@ -204,11 +286,24 @@ def error_against_delay(
     axes.set(
         xlabel=f"{words(delay).partition(' [')[0]}, mean [ms]",
         ylabel="position RMSE [m]",
-        ylim=(0.0, None),
     )
+    log = paper.get("log", "")
+    if "y" in log:
+        axes.set_yscale("log")
+        log_axis(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, None)
+    if "x" in log:  # a delay of 0 has no logarithm
+        axes.set_xscale("symlog", linthresh=points["ms"][points["ms"] > 0.0].min())
+        axes.set_xticks(sorted(points["ms"].unique()), minor=False)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
     axes.margins(x=0.02)
-    legend_above(axes)
-    sheet.title("Error against delay (shaded: 95 % interval over the seeds)")
+    _write_legend(axes, paper)
+    sheet.title(
+        f"Error against delay ({_over_seeds(points, 'shaded')}"
+        f"{_SHARES_NOTE if has_shares else ''})"
+    )
     return sheet.figure
 
 
@@ -225,8 +320,18 @@ def has_delays(table: SweepTable) -> bool:
 def _means(
     table: SweepTable, metric: str
 ) -> Any:  # Any: a DataFrame, whose columns have no types
-    """Return the means of `table`, with the half-width `half` of the 95 % interval (t; 0 for a single seed)."""
+    """Return the means of `table`, with the half-width `half` of the 95 % interval (t; 0 for a single seed).
+
+    `tracked` is the share of the time that is tracked, 1 where it is unknown.
+    """
     frame = table.means(metric)
+    share = next((name for name in _SHARES if name in table.metrics), None)
+    frame["tracked"] = 1.0
+    if share is not None and ".errors." in metric:
+        keys = [*table.shown_axes, "estimator"]
+        shares = table.means(share)[[*keys, "mean"]]
+        shares = shares.rename(columns={"mean": "share"})
+        frame["tracked"] = frame.merge(shares, on=keys, how="left")["share"].fillna(1.0)
     frame["half"] = np.nan_to_num(
         stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * frame["standard_error"]
     )
