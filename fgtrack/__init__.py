@@ -34,6 +34,9 @@ _HOMES = {
     "FgtrackError": "fgtrack.core.errors",
     "FileFormat": "fgtrack.inputs.source",
     "FloatArray": "fgtrack.core.types",
+    "Health": "fgtrack.pipeline.health",
+    "HealthLimits": "fgtrack.pipeline.health",
+    "HealthState": "fgtrack.pipeline.health",
     "IntArray": "fgtrack.core.types",
     "Lateness": "fgtrack.pipeline.live",
     "Ledger": "fgtrack.advice.ledger",
@@ -44,11 +47,13 @@ _HOMES = {
     "MountEstimate": "fgtrack.meaning.mounts",
     "Mounts": "fgtrack.meaning.mounts",
     "NS_PER_S": "fgtrack.core.time",
+    "Nis": "fgtrack.pipeline.health",
     "ObjectList": "fgtrack.inputs.formats.common",
     "Ranking": "fgtrack.ranking.result",
     "RobustLoss": "fgtrack.models.sensors",
     "Run": "fgtrack.runs",
     "ScheduledMeasurement": "fgtrack.evaluation.bounds",
+    "SensorHealth": "fgtrack.pipeline.health",
     "SensorModel": "fgtrack.models.sensors",
     "SensorPose": "fgtrack.models.measurement",
     "SmoothedReport": "fgtrack.core.types",
@@ -202,6 +207,11 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.sensors import SensorModel as SensorModel
     from fgtrack.noise.parameters import TuneReport as TuneReport
     from fgtrack.noise.tune import tune as tune
+    from fgtrack.pipeline.health import Health as Health
+    from fgtrack.pipeline.health import HealthLimits as HealthLimits
+    from fgtrack.pipeline.health import HealthState as HealthState
+    from fgtrack.pipeline.health import Nis as Nis
+    from fgtrack.pipeline.health import SensorHealth as SensorHealth
     from fgtrack.pipeline.live import Checkpoint as Checkpoint
     from fgtrack.pipeline.live import Lateness as Lateness
     from fgtrack.pipeline.live import TickTiming as TickTiming

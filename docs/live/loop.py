@@ -30,10 +30,12 @@ def run(
     due_ns = now_ns() // PERIOD_NS * PERIOD_NS
     while receiver.is_alive():
         due_ns = max(due_ns + PERIOD_NS, now_ns() // PERIOD_NS * PERIOD_NS)  # after a long tick: skip some
-        while (left_ns := due_ns - now_ns()) > 0 and receiver.is_alive():
+        while 0 < (left_ns := due_ns - now_ns()) <= PERIOD_NS and receiver.is_alive():
             time.sleep(min(left_ns / 1e9, 0.001))
-        if left_ns > 0:
+        if not receiver.is_alive():
             break
+        if left_ns > PERIOD_NS:  # the clock was set back
+            due_ns = now_ns() // PERIOD_NS * PERIOD_NS
         tracker.tick(due_ns)
         publish(due_ns - PUBLISHED_AGO_NS, tracker.tracks_at(due_ns - PUBLISHED_AGO_NS))
     tracker.tick(due_ns)  # what came last

@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import index as integer
 from pathlib import Path
@@ -42,9 +42,20 @@ from fgtrack.inputs.validation import (
 )
 from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.health import (
+    Health,
+    HealthLimits,
+    Source,
+    Watch,
+    delay_limits_s,
+    is_silent,
+    overall,
+    sensor_health,
+)
 from fgtrack.pipeline.rehearsal import rehearse
 from fgtrack.runs import Node
 from fgtrack.tracking.lives.latency import NEWEST
+from fgtrack.tracking.tracker import MultiObjectTracker
 from fgtrack.tracking.tracker_state import TrackerState
 
 if TYPE_CHECKING:
@@ -56,10 +67,14 @@ __all__ = ["Checkpoint", "Lateness", "TickTiming", "Tracker"]
 MOST_UNKNOWN = 100
 OTHERS = "other sensors"
 #: First bytes of a file of a saved tracker, with the version of its contents.
-_MAGIC = b"fgtrack tracker 1\n"
+_MAGIC = b"fgtrack tracker 2\n"
 #: Largest lead of a receipt before the tick; a larger lead comes from a wrong clock. After a smaller lead the tracker
 #: recovers by itself when the clock reaches the receipt.
 MOST_AHEAD_NS = 60 * NS_PER_S
+#: A tick that is earlier than the last one by more than this shows that the clock was set back, if it is not alone.
+MOST_BACK_NS = NS_PER_S
+#: Number of ticks in a row by which a clock that was set back is recognised.
+NUM_BACK = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +173,11 @@ class Tracker:
         "_skipped",
         "_warnings",
         "_need_ego",
+        "_watch",
+        "_misses",
+        "_num_back",
+        "_newest_id",
+        "_failed_before",
     )
     """Attributes that change beside the state of `_tracker` and the messages that have just arrived."""
 
@@ -175,9 +195,7 @@ class Tracker:
         )
         rehearse(config)
         self.config = config
-        self._tracker = build_tracker(
-            config, lambda parts: replace(parts, propagated_exceptions=(DataError,))
-        )
+        self._tracker = self._built(0)
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
@@ -199,7 +217,25 @@ class Tracker:
         self._warnings: dict[str, str] = {}  # by sensor
         # Sensors whose lists need the pose of the ego.
         self._need_ego: dict[str, None] = {}
+        self._watch = Watch(config.sensors)
+        self._misses: deque[bool] = deque(maxlen=NEWEST)
+        # Number of ticks in a row, up to now, that lie far before the last one that was accepted.
+        self._num_back = 0
+        self._newest_id = -1
+        # Failures before the clock was set back.
+        self._failed_before: Counter[str] = Counter()
         self._turn = threading.RLock()
+
+    def _built(self, first_track_id: int) -> MultiObjectTracker:
+        """Return a tracker of the configuration without tracks."""
+        return build_tracker(
+            self.config,
+            lambda parts: replace(
+                parts,
+                propagated_exceptions=(DataError,),
+                first_track_id=first_track_id,
+            ),
+        )
 
     @classmethod
     def from_config(
@@ -239,10 +275,13 @@ class Tracker:
     def failures(self) -> Mapping[str, int]:
         """Numbers of internal failures and of their consequences, by the kinds of `Failure`."""
         with self._turn:
-            return {
-                failure.value: count
-                for failure, count in self._tracker.failures.counts.items()
-            }
+            counts = Counter(
+                {
+                    failure.value: count
+                    for failure, count in self._tracker.failures.counts.items()
+                }
+            )
+            return self._failed_before + counts
 
     @property
     def last_failure(self) -> str | None:
@@ -302,6 +341,63 @@ class Tracker:
         late = None if ego_s is None else late_ego(ego_s, medians_s)
         if late is not None:
             yield str(late)
+
+    def health(self, limits: HealthLimits | None = None) -> Health:
+        """Return the state of the tracker with its reasons, and the statistics of each sensor and of the ego.
+
+        `limits` are the thresholds; None stands for the defaults.
+        """
+        limits = limits or HealthLimits()
+        with self._turn:
+            sources = {
+                name: Source(
+                    [
+                        seconds(delay_ns)
+                        for delay_ns in self._tracker.delays[name].newest_ns
+                    ],
+                    lateness.silent_s,
+                    self._watch.usual_gap_s(name),
+                )
+                for name, lateness in self.lateness.items()
+            }
+            used = self.config.used_sensors
+            by_name = {
+                name: sensor_health(
+                    source,
+                    delay_limits_s(self.config, name) if name in used else {},
+                    self._watch.by_sensor[name],
+                    limits,
+                )
+                for name, source in sources.items()
+                if name in used or (name == EGO and self._need_ego)
+            }
+            silent = {name for name in by_name if is_silent(sources[name], limits)}
+            stale = self._stale(silent)
+            return overall(by_name, stale, list(self._late_ticks(limits)))
+
+    def _stale(self, silent: Collection[str]) -> list[str]:
+        """Return the reasons for which tracks are predictions alone; `silent` sources send nothing."""
+        if self._last.tick < 0:
+            return ["ticks: none yet"]
+        reasons = []
+        starting = {
+            name
+            for name, sensor in self.config.used_sensors.items()
+            if sensor.births and sensor.gives_position
+        }
+        if starting and starting <= set(silent):
+            reasons.append("sensors: no sensor that starts tracks sends anything")
+        if EGO in silent:
+            reasons.append("ego: lists need its pose, and it sends nothing")
+        if self._num_back:
+            reasons.append("clock: ticks are before the last one")
+        return reasons
+
+    def _late_ticks(self, limits: HealthLimits) -> Iterator[str]:
+        """Yield the reason that too many ticks miss their deadline."""
+        share = sum(self._misses) / max(len(self._misses), 1)
+        if len(self._misses) >= limits.fewest and share > limits.missed_share:
+            yield f"ticks: {100.0 * share:.3g} % miss the deadline"
 
     @property
     def timing(self) -> TickTiming:
@@ -423,7 +519,9 @@ class Tracker:
             message, receipt_ns=now_ns if is_ahead else message.receipt_ns
         )
         if isinstance(message, EgoState):
+            self._watch.received(EGO, message.receipt_ns)
             return corrected_ego(message, self.config.ego.clock_offset_s)
+        self._watch.received(message.sensor, message.receipt_ns)
         message = corrected(message, self.config.sensors)
         if message.frame != "map":
             self._need_ego[message.sensor] = None
@@ -450,24 +548,39 @@ class Tracker:
         """Process all received messages, and predict all tracks to `now_ns`; raises `CallError` for an invalid time.
 
         A tick before the last tick is refused: it returns the tracks of the last tick,
-        and messages wait for the next tick.
+        and messages wait for the next tick. The third such tick in a row that is more than
+        a second early shows that the clock was set back: all tracks end, and new ones
+        start with the messages of the new time.
         """
         now_ns = _stamp("now_ns", now_ns)
         with self._turn:
             if self._last.tick >= 0 and now_ns < self._last.now_ns:
-                self._refused["tick before the last one"] += 1
-                return replace(self._last, updates=(), smoothed=())
+                is_far = self._last.now_ns - now_ns > MOST_BACK_NS
+                self._num_back = self._num_back + 1 if is_far else 0
+                if self._num_back < NUM_BACK:
+                    self._refused["tick before the last one"] += 1
+                    return replace(self._last, updates=(), smoothed=())
+                self._start_over(now_ns)
             begun_ns = perf_counter_ns()
             self._take_arrivals()
             self._deliver(now_ns)
             self._read_report()
             report = self._tracker.tick(now_ns)
-            report = replace(report, updates=(*self._records, *report.updates))
+            report = replace(
+                report,
+                tick=self._last.tick + 1,
+                updates=(*self._records, *report.updates),
+            )
             counts = self._counts_plus(report.updates)
             # One statement, so that an interrupt comes before or after it.
             self._counts, self._records, self._tracker.unread = counts, [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
+            misses = self._node.misses
             self._node.done_ns(now_ns, self._ticks_ns[-1])
+            self._misses.append(self._node.misses > misses)
+            self._watch.add(report.updates)
+            self._newest_id = max(self._newest_id, _newest_id(report.updates))
+            self._num_back = 0
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:
@@ -476,6 +589,31 @@ class Tracker:
                 )
             self._last = report
             return report
+
+    def _start_over(self, now_ns: int) -> None:
+        """End all tracks, because the clock was set back to `now_ns`; messages of the former time are refused."""
+        self._take_arrivals()
+        self._read_report()
+        former = self._tracker
+        former.finish()
+        records = [*self._records, *former.last_updates]
+        self._records, former.last_updates = records, ()
+        kept: list[EgoState | DetectionList] = []
+        for message in (*self._due, *self._ready):
+            if message.receipt_ns - now_ns <= MOST_BACK_NS // 2:
+                kept.append(message)
+            else:
+                reason = "received before the clock was set back"
+                self._records += self._refused_records(message, reason)
+        self._due, self._ready = [], kept
+        self._refused["clock was set back, tracks ended"] += 1
+        self._refused += former.refused_ego
+        self._failed_before = Counter(self.failures)
+        self._tracker = self._built(self._newest_id + 1)
+        self._watch = Watch(self.config.sensors)
+        node = Node(self._node.period_ns)
+        node.misses = self._node.misses
+        self._node, self._first_tick_ns = node, now_ns
 
     def _read_report(self) -> None:
         """Keep the records of a tick that was interrupted when it was done, for the next report."""
@@ -518,6 +656,13 @@ class Tracker:
         data = to_bytes(self.checkpoint())
         with new_file(Path(path), overwrite) as file:
             file.write(_MAGIC + data)
+
+    def __getstate__(self) -> Checkpoint:
+        return self.checkpoint()
+
+    def __setstate__(self, checkpoint: Checkpoint) -> None:
+        self.__init__(checkpoint.config)  # type: ignore[misc]  # an empty tracker, to which the state is given
+        self.restore(checkpoint)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -587,6 +732,18 @@ class Tracker:
             name = self._name_for_counts(sensor)
             result.setdefault(name, Counter())[disposition] += count
         return result
+
+
+def _newest_id(records: Iterable[UpdateRecord]) -> int:
+    """Return the largest number of a track that one of `records` has started; -1 without any."""
+    return max(
+        (
+            record.track_id
+            for record in records
+            if record.disposition is Disposition.BIRTH and record.track_id is not None
+        ),
+        default=-1,
+    )
 
 
 class _RefusedError(Exception):

@@ -49,6 +49,8 @@ class TrackerParts:
     """Log-odds of the fronts of tracks; None if every yaw is used as it was measured."""
     wait: PoseWait | None = None
     """Decides which lists wait for an ego message; None if no list waits."""
+    first_track_id: int = 0
+    """Number of the first track."""
     failures: Failures = field(default_factory=Failures)
     """Counts failures of all parts, also of `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)

@@ -30,7 +30,7 @@ class Tracks(Stateful):
 
     def __init__(self, parts: TrackerParts) -> None:
         self._parts = parts
-        self._next_id = 0
+        self._next_id = parts.first_track_id
         self.num_measured = Counter[int]()
         """Number of detections that have changed the state, by track."""
         # Of tracks with one position and an unknown heading, by id.

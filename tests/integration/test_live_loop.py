@@ -5,6 +5,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,33 @@ def test_the_loop_publishes_a_drive_and_accounts_for_every_detection() -> None:
     } == received
     assert tracker.lateness["radar"].delay_median_s == pytest.approx(0.06, abs=0.01)
     assert tracker.refused == tracker.failures == {}
+
+
+def test_the_loop_goes_on_publishing_after_the_clock_was_set_back() -> None:
+    loop = load_file(LOOP, "live")
+    tracker = fgtrack.Tracker.from_config("smoother", map="oval")
+    begin_ns, polls, back_ns = 1_000 * fgtrack.NS_PER_S, 0, 0
+    published = list[int]()
+
+    def now_ns() -> int:
+        nonlocal polls
+        polls += 1
+        return begin_ns + polls * 1_000_000 - back_ns
+
+    def source() -> Iterator[fgtrack.EgoState]:
+        nonlocal back_ns
+        while polls < 1_000:
+            time.sleep(0.0001)
+        back_ns = 5 * fgtrack.NS_PER_S
+        while polls < 2_000:
+            time.sleep(0.0001)
+        yield from ()
+
+    loop.run(tracker, source(), lambda stamp_ns, _: published.append(stamp_ns), now_ns)
+    assert tracker.refused["clock was set back, tracks ended"] == 1
+    backwards = [b - a for a, b in pairwise(published) if b < a]
+    assert len(backwards) == 1
+    assert len(published) > 60
 
 
 def test_the_drive_of_the_loop_keeps_the_stamps_of_the_simulation() -> None:
