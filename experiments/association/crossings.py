@@ -399,7 +399,7 @@ def beside_truth(
     present = np.ones((len(ticks), 2 * CARS_PER_LANE), dtype=bool)
     index = np.repeat(np.arange(len(ticks)), [len(rows) for _, rows in ticks])
     ids = np.array([row[0] for _, rows in ticks for row in rows], dtype=np.int64)
-    return Scenes(index, ids, np.concatenate(gaps_m), present, present)
+    return Scenes.of(index, ids, np.concatenate(gaps_m), present, present)
 
 
 TRACKERS = (

@@ -122,7 +122,7 @@ def squared_per_scan(
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     ticks = table[:, 0].astype(np.int64)
     present = np.isfinite(true_m[:, :, 0])
-    scenes = Scenes(
+    scenes = Scenes.of(
         ticks,
         table[:, 1].astype(np.int64),
         np.linalg.norm(true_m[ticks] - table[:, None, 2:], axis=-1),

@@ -78,9 +78,9 @@ def counted(matching: Matching) -> FloatArray:
         np.bincount(matching.tick_index[rows], minlength=n)
         for rows in (~paired, paired)
     )
-    distances_m = matching.distances_m[
-        np.flatnonzero(paired), matching.object_index[paired]
-    ]
+    x_m, y_m = matching.true_states[paired, :2].T
+    tracks = matching.tracks.where(paired)
+    distances_m = np.hypot(tracks["x_m"] - x_m, tracks["y_m"] - y_m)
     squared_m2 = np.bincount(matching.tick_index[paired], distances_m**2, minlength=n)
     found, switches = matching.track_ids != NO_TRACK, np.zeros(n)
     for ids, has in zip(matching.track_ids.T, found.T, strict=True):

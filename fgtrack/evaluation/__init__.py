@@ -25,7 +25,7 @@ _HOMES = {
     "NO_TRACK": "fgtrack.runs",
     "PREDICTION_STEP_S": "fgtrack.evaluation.scores.prediction",
     "RUN": "fgtrack.evaluation.tables",
-    "Scenes": "fgtrack.evaluation.matching",
+    "Scenes": "fgtrack.evaluation.scenes",
     "Statistic": "fgtrack.evaluation.intervals",
     "Table": "fgtrack.evaluation.tables",
     "Tables": "fgtrack.evaluation.tables",
@@ -66,13 +66,13 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.intervals import sums_by_stamp as sums_by_stamp
     from fgtrack.evaluation.intervals import within_run as within_run
     from fgtrack.evaluation.matching import Matching as Matching
-    from fgtrack.evaluation.matching import Scenes as Scenes
     from fgtrack.evaluation.matching import match as match
     from fgtrack.evaluation.matching import position_nees as position_nees
     from fgtrack.evaluation.matching import scenes as scenes
     from fgtrack.evaluation.metrics import Metrics as Metrics
     from fgtrack.evaluation.runs import EvaluatedRun as EvaluatedRun
     from fgtrack.evaluation.runs import evaluated as evaluated
+    from fgtrack.evaluation.scenes import Scenes as Scenes
     from fgtrack.evaluation.scores.innovations import LOCAL_NAMES as LOCAL_NAMES
     from fgtrack.evaluation.scores.innovations import Consistency as Consistency
     from fgtrack.evaluation.scores.innovations import (

@@ -1,17 +1,18 @@
 """Matching of tracks with true objects at every tick, and the errors of the matched tracks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
+from fgtrack.evaluation.scenes import NearPairs, Scenes, assigned
 from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import (
-    TRUE_STATE,
     TruePath,
     in_ignored_regions,
+    states_of,
     true_paths,
     visible,
 )
@@ -19,14 +20,16 @@ from fgtrack.runs import NO_TRACK, Columns, Run
 
 NO_OBJECT = -1
 """Object index of a track row without a true object."""
+# Number of pairs of a row and an object that are computed together.
+_BLOCK_PAIRS = 1 << 18
 
 
 @dataclass(frozen=True)
 class Matching:
     """Pairs of track rows and true objects. Objects are numbered by ascending id, without the ego."""
 
-    object_ids: tuple[int, ...]
-    """Id of each object in the truth."""
+    paths: tuple[TruePath, ...]
+    """Truth of each object."""
     tracks: Columns
     """The r evaluated rows of tracks.csv, during the time with truth."""
     object_index: IntArray
@@ -36,11 +39,8 @@ class Matching:
 
     NaN for a row without an object.
     """
-    distances_m: FloatArray
-    """Distance of each row from every object at the row's stamp, shape (r, objects).
-
-    NaN where the object has no truth.
-    """
+    near: NearPairs
+    """Pairs of a row and an object at the row's stamp, nearer than twice the gate."""
     now_ns: IntArray
     """Time of each tick, shape (ticks,)."""
     tick_index: IntArray
@@ -53,25 +53,14 @@ class Matching:
     """Mask of objects that some sensor could detect, shape (ticks, objects), see `visible`."""
 
     @property
+    def object_ids(self) -> tuple[int, ...]:
+        """Id of each object in the truth."""
+        return tuple(path.object_id for path in self.paths)
+
+    @property
     def paired(self) -> BoolArray:
         """Mask of the rows with an object, shape (r,)."""
         return np.asarray(self.object_index != NO_OBJECT)
-
-
-@dataclass(frozen=True)
-class Scenes:
-    """Tracks and true objects at t ticks; r rows of tracks by ascending tick."""
-
-    tick_index: IntArray
-    """Tick of each row in ascending order, shape (r,)."""
-    track_ids: IntArray
-    """Track of each row, shape (r,)."""
-    distances_m: FloatArray
-    """Distance of each row from every object, shape (r, objects); infinity for an absent object."""
-    present: BoolArray
-    """Mask of present objects, shape (t, objects)."""
-    in_view: BoolArray
-    """Mask of present objects that some sensor could detect, shape (t, objects)."""
 
 
 @dataclass(frozen=True)
@@ -113,22 +102,26 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
-    candidates, distances_m = distances(tracks, paths)
+    near = near_pairs(tracks, paths, 2.0 * options.gate_m)
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    object_index = nearest_pairs(
-        distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m
+    object_index = nearest_objects(
+        near,
+        tracks["track_id"],
+        tick_index,
+        timing.num_rows,
+        len(paths),
+        options.gate_m,
     )
     paired = np.flatnonzero(object_index != NO_OBJECT)
     track_ids = np.full((timing.num_rows, len(paths)), NO_TRACK)
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
-    true_states = np.full((tracks.num_rows, len(TRUE_STATE)), np.nan)
-    true_states[paired] = candidates[paired, object_index[paired]]
+    states = states_of(paths, object_index, tracks["stamp_ns"])
     return Matching(
-        object_ids=tuple(path.object_id for path in paths),
+        paths=tuple(paths),
         tracks=tracks,
         object_index=object_index,
-        true_states=true_states,
-        distances_m=distances_m,
+        true_states=states,
+        near=near,
         now_ns=timing["now_ns"],
         tick_index=tick_index,
         present=np.stack(
@@ -137,49 +130,6 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         track_ids=track_ids,
         in_view=visible(run, paths, timing["now_ns"]),
     )
-
-
-def pair(
-    scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray
-) -> IntArray:
-    """Return the object of every row, shape (rows,), with the largest sum of scores at each tick.
-
-    `NO_OBJECT` for a row without an object. `scores` (rows, objects) are 0 for pairs
-    that are not allowed. `ids` and `tick_index` (rows,) are the track and the tick of
-    each row. Allowed pairs of the tick `previous` (ticks,) stay.
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    num_ticks = len(previous)
-    num_objects = scores.shape[1]
-    inside = scores > 0.0
-    object_index = np.full(len(ids), NO_OBJECT)
-    # A tick is clear if each row has at most one allowed object, and each object one allowed row.
-    rows, columns = np.nonzero(inside)
-    rows_per_object = np.bincount(
-        tick_index[rows] * num_objects + columns, minlength=num_ticks * num_objects
-    ).reshape(num_ticks, num_objects)
-    unclear = np.asarray((rows_per_object > 1).any(axis=1))
-    unclear[tick_index[inside.sum(axis=1) > 1]] = True
-    clear_rows, columns = np.nonzero(inside & ~unclear[tick_index, None])
-    object_index[clear_rows] = columns
-    order = np.argsort(tick_index, kind="stable")
-    edges = np.searchsorted(tick_index[order], np.arange(num_ticks + 1)).tolist()
-    for k in np.flatnonzero(unclear).tolist():
-        rows = order[edges[k] : edges[k + 1]]
-        last = int(previous[k])
-        before = order[edges[last] : edges[last + 1]] if last >= 0 else rows[:0]
-        before = before[object_index[before] != NO_OBJECT]
-        track_of = np.full(scores.shape[1], NO_TRACK)
-        track_of[object_index[before]] = ids[before]
-        mine = scores[rows]
-        stays = inside[rows] & (ids[rows, None] == track_of)
-        chosen, columns = linear_sum_assignment(
-            mine + (1.0 + mine.sum()) * stays, maximize=True
-        )
-        allowed = inside[rows][chosen, columns]
-        object_index[rows[chosen[allowed]]] = columns[allowed]
-    return object_index
 
 
 def track_errors(matching: Matching) -> TrackErrors:
@@ -250,14 +200,16 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
     tick_index = (np.cumsum(scored) - 1)[matching.tick_index[rows]]
     present = matching.present[scored]
-    distances_m = matching.distances_m[rows]
-    distances_m = np.where(
-        present[tick_index] & np.isfinite(distances_m), distances_m, np.inf
-    )
+    row_of = np.full(matching.tracks.num_rows, -1)
+    row_of[rows] = np.arange(len(rows))
+    near = matching.near
+    near = replace(near, rows=row_of[near.rows])
+    near = near.where(near.rows >= 0)
+    near = near.where(present[tick_index[near.rows], near.objects])
     return Scenes(
         tick_index,
         matching.tracks["track_id"][rows],
-        distances_m,
+        near.where(np.lexsort((near.objects, near.rows))),
         present,
         matching.in_view[scored],
     )
@@ -317,45 +269,66 @@ def _ignored(
     unknown = dict.fromkeys(
         ("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan)
     )
-    _, distances_m = distances(
-        tracks, [*paths, *true_paths(Columns({**objects, **unknown}))]
-    )
+    paths = [*paths]
+    known = len(paths)
+    paths += true_paths(Columns({**objects, **unknown}))
     timing = run.tables["timing"]
     stamps_ns = tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    index = nearest_pairs(
-        distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m
+    near = near_pairs(tracks, paths, 2.0 * gate_m)
+    index = nearest_objects(
+        near, tracks["track_id"], tick_index, timing.num_rows, len(paths), gate_m
     )
     in_regions = in_ignored_regions(
         run, stamps_ns, np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     )
-    return np.asarray((index >= len(paths)) | ((index == NO_OBJECT) & in_regions))
+    return np.asarray((index >= known) | ((index == NO_OBJECT) & in_regions))
 
 
-def distances(
-    tracks: Columns, paths: Sequence[TruePath]
-) -> tuple[FloatArray, FloatArray]:
-    """Return true states (rows, objects, 5) at the stamps of `tracks`, and distances (rows, objects).
+def near_pairs(tracks: Columns, paths: Sequence[TruePath], limit_m: float) -> NearPairs:
+    """Return the pairs of a row of `tracks` and an object of `paths` that are nearer than `limit_m`.
 
-    NaN where an object has no truth.
+    The truth is that at the stamp of the row. The rows are processed in blocks.
     """
-    candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
-    return candidates, np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
+    parts = []
+    size = max(1, _BLOCK_PAIRS // len(paths))
+    for first in range(0, len(xy), size):
+        block = slice(first, first + size)
+        true_m = np.stack(
+            [path.at(tracks["stamp_ns"][block])[:, :2] for path in paths], axis=1
+        )
+        distances_m = np.linalg.norm(true_m - xy[block, None], axis=-1)
+        part = NearPairs.of(distances_m, limit_m)
+        parts.append(replace(part, rows=part.rows + first))
+    if not parts:
+        return NearPairs.of(np.empty((0, len(paths))), limit_m)
+    return NearPairs(
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.objects for part in parts]),
+        np.concatenate([part.distances_m for part in parts]),
+        limit_m,
+    )
 
 
-def nearest_pairs(
-    distances_m: FloatArray,
+def nearest_objects(
+    near: NearPairs,
     ids: IntArray,
     tick_index: IntArray,
     num_ticks: int,
+    num_objects: int,
     gate_m: float,
 ) -> IntArray:
     """Return the object of every row: as many pairs as possible, then the least sum of distances.
 
-    No pair is farther apart than `gate_m`. Pairs of the previous tick stay, see `pair`.
+    No pair is farther apart than `gate_m`. Pairs of the previous tick stay, see
+    `assigned`. `NO_OBJECT` for a row without an object.
     """
     # One more pair outweighs all distances, which are at most 1 in units of the gate.
-    objects = distances_m.shape[1]
-    scores = np.where(distances_m <= gate_m, objects + 1.0 - distances_m / gate_m, 0.0)
-    return pair(scores, ids, tick_index, np.arange(num_ticks) - 1)
+    share = near.distances_m / gate_m
+    scores = np.where(near.distances_m <= gate_m, num_objects + 1.0 - share, 0.0)
+    previous = np.arange(num_ticks) - 1
+    pairs = near.where(assigned(near, scores, ids, tick_index, previous, num_objects))
+    object_index = np.full(len(ids), NO_OBJECT)
+    object_index[pairs.rows] = pairs.objects
+    return object_index

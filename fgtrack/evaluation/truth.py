@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -17,6 +18,8 @@ from fgtrack.runs import Columns, Run
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
+# Number of states that are interpolated together.
+_BLOCK_ROWS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,15 @@ class TruePath:
     """Distinct stamps in ascending order, shape (n,)."""
     states: FloatArray
     """x, y, yaw, speed and yaw rate at the stamps, shape (n, 5); NaN where the truth has no value."""
+
+    @cached_property
+    def _periods_ns(self) -> IntArray:
+        return np.diff(self.stamps_ns)
+
+    @cached_property
+    def _longest_gap_ns(self) -> float:
+        median_ns = float(np.median(self._periods_ns))
+        return max(_SHORTEST_GAP_NS, _GAP_PERIODS * median_ns)
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """Return the states at `stamps_ns` (m,), shape (m, 5); NaN without truth.
@@ -41,7 +53,7 @@ class TruePath:
             return np.where(
                 (stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan
             )
-        periods_ns = np.diff(self.stamps_ns)
+        periods_ns = self._periods_ns
         left = np.clip(
             np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1,
             0,
@@ -59,7 +71,7 @@ class TruePath:
         from_a = (1 + 2 * v) * (1 - v) ** 2 * a[:, :2] + v * (1 - v) ** 2 * way_a
         curve = from_a + v**2 * (3 - 2 * v) * b[:, :2] - v**2 * (1 - v) * way_b
         states[:, :2] = np.where(np.isfinite(curve), curve, states[:, :2])
-        away = h_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * float(np.median(periods_ns)))
+        away = h_ns > self._longest_gap_ns
         states[(u < 0.0) | (u > 1.0) | (away & (u > 0.0) & (u < 1.0))] = np.nan
         # At a truth stamp the result is the recorded state, even if a neighbour has no value.
         for end, mine in ((a, u == 0.0), (b, u == 1.0)):
@@ -84,17 +96,20 @@ def true_paths(truth: Columns) -> list[TruePath]:
     return paths
 
 
-def true_states(
-    truth: Columns, object_index: IntArray, stamps_ns: IntArray
+def states_of(
+    paths: Sequence[TruePath], object_index: IntArray, stamps_ns: IntArray
 ) -> FloatArray:
-    """Return the true states at `stamps_ns` (n,), shape (n, 5); NaN without truth.
+    """Return the true states at `stamps_ns` (n,), shape (n, 5).
 
-    `object_index` (n,) are indices into `true_paths`.
+    `object_index` (n,) are indices into `paths`. NaN without truth, and for an index
+    without a path. The states are interpolated in blocks.
     """
     states = np.full((len(stamps_ns), len(TRUE_STATE)), np.nan)
-    for index, path in enumerate(true_paths(truth)):
-        mine = object_index == index
-        states[mine] = path.at(stamps_ns[mine])
+    for index, path in enumerate(paths):
+        mine = np.flatnonzero(object_index == index)
+        for first in range(0, len(mine), _BLOCK_ROWS):
+            block = mine[first : first + _BLOCK_ROWS]
+            states[block] = path.at(stamps_ns[block])
     return states
 
 

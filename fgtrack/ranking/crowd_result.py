@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import average
-from fgtrack.evaluation.matching import Scenes
+from fgtrack.evaluation.scenes import Scenes
 from fgtrack.evaluation.scores.multi_object import multi_object_metrics
 from fgtrack.evaluation.scores.t_gospa import t_gospa
 from fgtrack.evaluation.tables import Column, Table
@@ -134,7 +134,7 @@ def _scenes(
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     ticks = table[:, 0].astype(np.int64)
     present = np.isfinite(true_m[:, :, 0])
-    return Scenes(
+    return Scenes.of(
         ticks,
         table[:, 1].astype(np.int64),
         np.linalg.norm(true_m[ticks] - table[:, None, 2:], axis=-1),

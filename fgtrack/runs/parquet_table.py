@@ -6,6 +6,7 @@ The module needs the package pyarrow (extra `parquet`).
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +29,8 @@ from fgtrack.runs.schema import (
 #: Number of rows that are written together; a larger number compresses no better.
 _GROUP_ROWS = 1 << 16
 _BLOCK_ROWS = 1 << 13
+#: Largest column that is kept. To read such a column again for each of its rows would take minutes.
+_KEPT_BYTES = 1 << 23
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 #: A stream of bytes for each byte of a number compresses best: neighbours share exponents, but no digits.
 _ENCODINGS = {int: "DELTA_BINARY_PACKED", float: "BYTE_STREAM_SPLIT"}
@@ -100,9 +103,10 @@ class ParquetTable:
 
 
 class ParquetColumns(Columns):
-    """Columns of a Parquet file, each of which is read at first use.
+    """Columns of a Parquet file, each of which is read when it is used.
 
-    Raises `DataError` where a column cannot be read.
+    A column of more than 8 MB is kept only while it is in use, so a long run needs the
+    memory of a few columns. Raises `DataError` where a column cannot be read.
     """
 
     def __init__(self, path: Path, table: str) -> None:
@@ -112,6 +116,7 @@ class ParquetColumns(Columns):
         self._names = COLUMNS[table]
         self._written = frozenset(self._file.schema_arrow.names)
         self._columns = {}
+        self._in_use: WeakValueDictionary[str, Column] = WeakValueDictionary()
         expected = [
             name
             for name in self._names
@@ -122,9 +127,12 @@ class ParquetColumns(Columns):
             raise ValueError(f"the columns must be {','.join(self._names)}")
 
     def __getitem__(self, name: str) -> Column:
-        if name not in self._columns:
-            self._columns[name] = read_only(self._read(name))
-        return self._columns[name]
+        values = self._in_use.get(name)
+        if values is None:
+            self._in_use[name] = values = read_only(self._read(name))
+            if values.nbytes <= _KEPT_BYTES:
+                self._columns[name] = values
+        return values
 
     def __reduce__(self) -> tuple[type[Columns], tuple[Mapping[str, Column]]]:
         return Columns, (dict(self),)

@@ -98,9 +98,11 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
         )
         yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), latched=True))
     states = np.nan_to_num(np.stack([ego[name] for name in STATE_NAMES], axis=-1))
-    for row in rows[np.argsort(ego["receipt_ns"][rows], kind="stable")].tolist():
-        stamp_ns = int(ego["stamp_ns"][row])
-        receipt_ns = int(ego["receipt_ns"][row])
+    stamps_ns = ego["stamp_ns"]
+    receipts_ns = ego["receipt_ns"]
+    for row in rows[np.argsort(receipts_ns[rows], kind="stable")].tolist():
+        stamp_ns = int(stamps_ns[row])
+        receipt_ns = int(receipts_ns[row])
         yield ViewerMessage(
             receipt_ns,
             stamp_ns,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.evaluation.matching import Scenes
+from fgtrack.evaluation.scenes import Scenes
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,6 @@ def as_scenes(objects: Positions, tracks: Positions, count: int) -> Scenes:
         block[:, ids] = np.linalg.norm(tracks.xy[tick][:, None] - xy, axis=-1)
         blocks.append(block)
     tick_index = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
-    return Scenes(
+    return Scenes.of(
         tick_index, np.concatenate(tracks.ids), np.concatenate(blocks), present, present
     )

@@ -12,7 +12,13 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
-from fgtrack.evaluation.matching import NO_OBJECT, match, nearest_pairs, track_errors
+from fgtrack.evaluation.matching import (
+    NO_OBJECT,
+    match,
+    nearest_objects,
+    track_errors,
+)
+from fgtrack.evaluation.scenes import NearPairs
 from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.runs import NO_TRACK
@@ -144,12 +150,20 @@ def test_a_track_with_an_infinite_state_is_paired_to_nothing(tmp_path: Path) -> 
     assert matching.object_index.tolist() == [NO_OBJECT, 0]
 
 
+def nearest(
+    distances_m: np.ndarray, ids: np.ndarray, tick_index: np.ndarray, num_ticks: int
+) -> np.ndarray:
+    """Object of each row, at most 10 m apart."""
+    near = NearPairs.of(distances_m)
+    return nearest_objects(
+        near, ids, tick_index, num_ticks, distances_m.shape[1], gate_m=10.0
+    )
+
+
 def assigned(distances_m: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of the rows of one tick; infinite distances lie outside the gate."""
     rows = np.arange(len(distances_m))
-    columns = nearest_pairs(
-        distances_m, rows, np.zeros(len(rows), np.int64), 1, 10.0
-    ).tolist()
+    columns = nearest(distances_m, rows, np.zeros(len(rows), np.int64), 1).tolist()
     return [(row, column) for row, column in enumerate(columns) if column != NO_OBJECT]
 
 
@@ -210,10 +224,7 @@ def test_pairs_inside_the_gate_stay_and_the_rest_is_assigned(
         for row, column in kept.items():
             expected[row] = column
         last = {ids[row]: column for row, column in kept.items()}
-    assert (
-        nearest_pairs(distances_m, ids, tick_index, ticks, 10.0).tolist()
-        == expected.tolist()
-    )
+    assert nearest(distances_m, ids, tick_index, ticks).tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from evaluation_scenes import Positions, random_scenes
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackReport
-from fgtrack.evaluation.matching import Scenes, match, scenes
+from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.metrics import evaluate
+from fgtrack.evaluation.scenes import Scenes
 from fgtrack.evaluation.scores.multi_object import (
     MultiObjectMetrics,
     gospa,
@@ -110,7 +111,7 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
 
 
 def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
-    there = Scenes(
+    there = Scenes.of(
         np.array([0]),
         np.array([1]),
         np.array([[2.0]]),
@@ -190,7 +191,7 @@ def test_clear_identity_and_hota_are_those_of_trackeval(
 
 def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
     for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
-        there = Scenes(
+        there = Scenes.of(
             np.array([0]),
             np.array([1]),
             np.array([[distance_m]]),
@@ -291,7 +292,8 @@ def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(
     run = write_run(tmp_path / "run", [[], [], [], [WEST.track(2, 1)], []], truth=truth)
     matching = match(run)
     assert matching is not None
-    assert matching.distances_m[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert (matching.near.rows.tolist(), matching.near.objects.tolist()) == ([0], [0])
+    assert matching.near.distances_m[0] == pytest.approx(0.0, abs=1e-9)
     clear = multi_object(run).clear
     assert (clear["pairs"], clear["misses"], clear["false_positives"]) == (0, 8, 1)
 

@@ -1,6 +1,7 @@
 """T-GOSPA against the authors' value, the complete linear program, and scenes that can be counted by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from evaluation_scenes import random_scenes
 from scipy.optimize import linprog
 from support.messages import shared
 
-from fgtrack.evaluation.matching import Scenes
+from fgtrack.evaluation.scenes import NearPairs, Scenes
 from fgtrack.evaluation.scores.t_gospa import t_gospa
 
 C_M = 5.0
@@ -22,7 +23,7 @@ def on_a_line(objects_m: list[list[float]], tracks_m: list[list[float]]) -> Scen
     ticks, columns = np.nonzero(np.isfinite(tracks))
     distances_m = np.abs(objects[ticks] - tracks[ticks, columns][:, None])
     present = np.isfinite(objects)
-    return Scenes(
+    return Scenes.of(
         ticks,
         columns,
         np.where(present[ticks], distances_m, np.inf),
@@ -91,7 +92,9 @@ def test_the_value_of_the_authors_is_met() -> None:
     ticks, columns = np.nonzero(np.isfinite(estimate[:, :, 0]))
     apart = np.linalg.norm(truth[ticks] - estimate[ticks, columns][:, None], axis=-1)
     present = np.isfinite(truth[:, :, 0])
-    scenes = Scenes(ticks, columns, np.nan_to_num(apart, nan=np.inf), present, present)
+    scenes = Scenes.of(
+        ticks, columns, np.nan_to_num(apart, nan=np.inf), present, present
+    )
     found = t_gospa(scenes, 10.0, 1.0)
     assert found["rms_m"] * math.sqrt(20) == pytest.approx(42.425860387417, abs=1e-9)
 
@@ -104,7 +107,7 @@ def test_the_reduced_program_has_the_optimum_of_the_complete_program(
     _, _, scenes = random_scenes(seed, side_m)
     num_ticks = min(len(scenes.present), 12)
     kept = scenes.tick_index < num_ticks
-    scenes = Scenes(
+    scenes = Scenes.of(
         scenes.tick_index[kept],
         scenes.track_ids[kept],
         scenes.distances_m[kept],
@@ -161,5 +164,48 @@ def test_without_tracks_every_object_is_missed() -> None:
 def test_without_ticks_the_values_are_unknown() -> None:
     empty = np.zeros((0, 2))
     none = np.zeros(0, dtype=np.int64)
-    scenes = Scenes(none, none, empty, empty.astype(bool), empty.astype(bool))
+    scenes = Scenes.of(none, none, empty, empty.astype(bool), empty.astype(bool))
     assert all(map(math.isnan, t_gospa(scenes, C_M).values()))
+
+
+def cut_into(num_ticks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut every longer run into windows of `num_ticks`."""
+    for name in ("MOST_TICKS", "WINDOW_TICKS"):
+        monkeypatch.setattr(f"fgtrack.evaluation.scores.t_gospa.{name}", num_ticks)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_cut_into_windows_lowers_the_sum_by_at_most_a_switch_for_each_object(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = random_scenes(seed, side_m=8.0)[2]
+    num_ticks, num_objects = scenes.present.shape
+    complete = t_gospa(scenes, C_M, SWITCH_M)
+    cut_into(4, monkeypatch)
+    cut = t_gospa(scenes, C_M, SWITCH_M)
+    num_cuts = math.ceil(num_ticks / 4) - 1
+    assert (complete["windows"], cut["windows"]) == (1, num_cuts + 1)
+    lower_m2 = num_ticks * (complete["rms_m"] ** 2 - cut["rms_m"] ** 2)
+    assert -1e-9 <= lower_m2 <= num_cuts * num_objects * SWITCH_M**2 + 1e-9
+
+
+def test_windows_cut_the_cost_of_a_switch_between_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another track takes the object over exactly where the first window ends."""
+    off = math.nan
+    objects_m = [[0.0] * 6]
+    tracks_m = [[0.0] * 3 + [off] * 3, [off] * 3 + [0.0] * 3]
+    scenes = on_a_line(objects_m, tracks_m)
+    assert t_gospa(scenes, C_M, SWITCH_M)["switches_m2"] == pytest.approx(
+        SWITCH_M**2 / 6
+    )
+    cut_into(3, monkeypatch)
+    assert t_gospa(scenes, C_M, SWITCH_M)["rms_m"] == 0.0
+
+
+def test_a_cut_off_beyond_the_known_pairs_is_refused() -> None:
+    scenes = on_a_line([[0.0]], [[3.0]])
+    near = NearPairs.of(scenes.distances_m, limit_m=4.0)
+    with pytest.raises(ValueError, match="match the run with a larger gate_m"):
+        t_gospa(replace(scenes, near=near), C_M)

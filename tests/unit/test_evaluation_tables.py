@@ -418,7 +418,7 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
     # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
     assert rows_of(tables, "multi_object") == [
         "run 5.71 2.75 3.54 3.54 0.000 5.71 -12.5 25.0 30.1 24.6 36.8 1 0.060 4.04 4.04 "
-        "5.73 7.56 12.5 12.5 0.250"
+        "5.73 7.56 12.5 12.5 0.250 1.00"
     ]
     table = tables["multi_object"]
     assert (table["mota"][0], table["assa"][0]) == pytest.approx((-0.125, 7 / 19))

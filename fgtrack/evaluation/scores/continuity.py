@@ -4,8 +4,12 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FUSED, FloatArray, IntArray
-from fgtrack.evaluation.matching import Matching, confirmed, distances, published_rows
-from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.matching import (
+    Matching,
+    confirmed,
+    near_pairs,
+    published_rows,
+)
 from fgtrack.runs import NO_TRACK, Run
 
 _SHORTEST_ABSENCE_NS = NS_PER_S
@@ -44,16 +48,20 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
         np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK)
     )
     rows = published_rows(tracks, updates["tick"], updates["track_id"])
-    _, distances_m = distances(
-        tracks.where(rows[rows >= 0]), true_paths(run.tables["truth"])
+    near = near_pairs(
+        tracks.where(rows[rows >= 0]),
+        matching.paths,
+        2.0 * gate_m,
     )
-    distances_m = np.where(distances_m <= gate_m, distances_m, np.inf)
-    near = np.isfinite(distances_m).any(axis=1)
     first_ns = run.tables["truth"]["stamp_ns"].min()
+    near = near.where(near.distances_m <= gate_m)
+    # The nearest object of each row comes first.
+    near = near.where(np.lexsort((near.objects, near.distances_m, near.rows)))
+    near = near.where(np.unique(near.rows, return_index=True)[1])
     paired = matching.paired & confirmed(matching.tracks)
-    detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near] - first_ns)
+    detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near.rows] - first_ns)
     confirmed_ns = pd.Series(matching.now_ns[matching.tick_index[paired]] - first_ns)
-    begin_ns = detected_ns.groupby(distances_m[near].argmin(axis=1)).min()
+    begin_ns = detected_ns.groupby(near.objects).min()
     times_s = (
         confirmed_ns.groupby(matching.object_index[paired]).min() - begin_ns
     ) / NS_PER_S

@@ -17,7 +17,7 @@ from fgtrack.evaluation.matching import (
     state_errors,
 )
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.evaluation.truth import true_states
+from fgtrack.evaluation.truth import states_of
 from fgtrack.runs import Columns, Run
 
 WINDOW: Literal["window"] = "window"
@@ -132,7 +132,7 @@ def _with_truth(
     rows = np.where(
         stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after
     )
-    truth = true_states(run.tables["truth"], matching.object_index[rows], stamps_ns)
+    truth = states_of(matching.paths, matching.object_index[rows], stamps_ns)
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]
 

@@ -5,9 +5,9 @@ GOSPA uses the best assignment of tracks to objects within the cut-off distance 
 
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
 
-CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does. motrics 0.3 differs
-outside the gate and in switches. IDF1 (Ristani et al. 2016) and HOTA (Luiten et al.
-2021) come from motrics, with the similarity 1 - d / (2 gate).
+CLEAR (Bernardin and Stiefelhagen 2008), IDF1 (Ristani et al. 2016) and HOTA (Luiten et
+al. 2021) count as TrackEval does, with the similarity 1 - d / (2 gate). The libraries
+take matrices of all pairs as lists, which a recording of an hour does not allow.
 """
 
 import math
@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from motrics import compute_hota_from_similarity, compute_identity_from_similarity
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
+from fgtrack.evaluation.scenes import Scenes
 from fgtrack.evaluation.scores.continuity import switches
+from fgtrack.evaluation.scores.identities import hota, identity
 from fgtrack.evaluation.scores.registry import registered_metrics
 from fgtrack.runs import NO_TRACK
 
@@ -60,64 +60,39 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
         "rms_m": math.sqrt(means_m2.pop("total_m2")),
     }
     roots["in_view_rms_m"] = math.sqrt(means_m2.pop("in_view_m2"))
-    similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
-    edges = np.searchsorted(scenes.tick_index, np.arange(1, len(scenes.present)))
-    frames = (
-        [np.flatnonzero(here).tolist() for here in scenes.present],
-        [
-            ids.tolist()
-            for _, ids in zip(
-                scenes.present, np.split(scenes.track_ids, edges), strict=False
-            )
-        ],
-        [
-            of.T[here].tolist()
-            for here, of in zip(
-                scenes.present, np.split(similarity, edges), strict=False
-            )
-        ],
-    )
-    identity = compute_identity_from_similarity(*frames, AT_GATE)
-    hota = compute_hota_from_similarity(*frames)
+    similarity = _similarity(scenes, gate_m)
     return MultiObjectMetrics(
         {"c_m": gate_m, "ticks": len(scenes.present), **roots, **means_m2},
         clear(scenes, gate_m),
-        {
-            name: getattr(identity, name) if identity.num_gt else math.nan
-            for name in ("idf1", "idp", "idr")
-        },
-        {
-            name: getattr(hota, name) if hota.num_gt else math.nan
-            for name in ("hota", "deta", "assa")
-        },
+        identity(scenes, similarity, AT_GATE),
+        hota(scenes, similarity),
         registered_metrics(scenes, gate_m),
     )
 
 
 def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     """CLEAR of `scenes`: pairs of the last tick stay, the rest has the largest sum of similarities within `gate_m`."""
-    similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
+    similarity = _similarity(scenes, gate_m)
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
     num_ticks = len(scenes.present)
     num_rows = np.bincount(scenes.tick_index, minlength=len(scenes.present))
     used = scenes.present.any(axis=1) & (num_rows > 0)
     last = np.maximum.accumulate(np.where(used, np.arange(num_ticks), 0))
-    columns = pair(
-        scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1]
-    )
-    paired = np.flatnonzero(columns != NO_OBJECT)
+    found = scenes.assigned(scores, np.concatenate([[-1], last])[:-1])
     track_ids = np.full(scenes.present.shape, NO_TRACK)
-    track_ids[scenes.tick_index[paired], columns[paired]] = scenes.track_ids[paired]
+    track_ids[scenes.tick_index[found.rows], found.objects] = scenes.track_ids[
+        found.rows
+    ]
     switched = sum(len(switches(column)) for column in track_ids.T)
-    pairs = len(paired)
+    pairs = len(found.rows)
     objects = int(scenes.present.sum())
     misses = objects - pairs
-    false_positives = len(columns) - pairs
+    false_positives = len(scenes.tick_index) - pairs
     return {
         "mota": 1.0 - (misses + false_positives + switched) / objects
         if objects
         else math.nan,
-        "motp_m": _mean(scenes.distances_m[paired, columns[paired]]),
+        "motp_m": _mean(found.distances_m),
         "pairs": pairs,
         "misses": misses,
         "false_positives": false_positives,
@@ -132,16 +107,15 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     farther do not count. `out_of_view_m2` is the part of `missed_m2` for objects that
     no sensor could detect.
     """
-    gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
+    scenes.near.check(c_m)
+    gains_m2 = np.maximum(c_m**2 - np.square(scenes.near.distances_m), 0.0)
     num_ticks = len(scenes.present)
     tick_index = scenes.tick_index
-    columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))
-    rows = np.flatnonzero(columns != NO_OBJECT)
-    columns = columns[rows]
-    ticks = tick_index[rows]
-    squares_m2 = np.square(scenes.distances_m[rows, columns])
+    pairs = scenes.assigned(gains_m2, np.full(num_ticks, -1))
+    ticks = tick_index[pairs.rows]
+    squares_m2 = np.square(pairs.distances_m)
     paired = np.zeros_like(scenes.present)
-    paired[ticks, columns] = True
+    paired[ticks, pairs.objects] = True
     single_m2 = c_m**2 / 2.0
     missed = scenes.present & ~paired
     localisation_m2 = np.asarray(
@@ -163,6 +137,12 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
         "total_m2": total_m2,
         "in_view_m2": total_m2 - unseen_m2,
     }
+
+
+def _similarity(scenes: Scenes, gate_m: float) -> FloatArray:
+    """Return the similarity of each near pair, shape (k,): 1 at distance 0, and 0 at twice the gate."""
+    scenes.near.check(2.0 * gate_m)
+    return np.maximum(0.0, 1.0 - scenes.near.distances_m / (2.0 * gate_m))
 
 
 def _mean(values: FloatArray) -> float:

@@ -7,7 +7,7 @@ with p = 2.
 
 import numpy as np
 
-from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
+from fgtrack.evaluation.scenes import Scenes
 
 
 def ospa(scenes: Scenes, c_m: float) -> dict[str, float]:
@@ -21,13 +21,13 @@ def ospa(scenes: Scenes, c_m: float) -> dict[str, float]:
     OSPA is 0 if both sets are empty.
     """
     num_ticks = len(scenes.present)
-    gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
-    objects = pair(
-        gains_m2, scenes.track_ids, scenes.tick_index, np.full(num_ticks, -1)
-    )
-    rows = np.flatnonzero(objects != NO_OBJECT)
+    scenes.near.check(c_m)
+    gains_m2 = np.maximum(c_m**2 - np.square(scenes.near.distances_m), 0.0)
+    pairs = scenes.assigned(gains_m2, np.full(num_ticks, -1))
     gain_m2 = np.bincount(
-        scenes.tick_index[rows], gains_m2[rows, objects[rows]], num_ticks
+        scenes.tick_index[pairs.rows],
+        np.maximum(c_m**2 - np.square(pairs.distances_m), 0.0),
+        num_ticks,
     )
     num_tracks = np.bincount(scenes.tick_index, minlength=num_ticks)
     larger = np.maximum(num_tracks, scenes.present.sum(axis=1))

@@ -10,12 +10,14 @@ from fgtrack.evaluation.matching import Matching, TrackErrors, confirmed
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.predictor import arc_positions, rail_positions
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.evaluation.truth import TRUE_STATE, true_states
+from fgtrack.evaluation.truth import TRUE_STATE, states_of
 from fgtrack.runs import Run
 
 #: Horizons of the predictions [s].
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
 PREDICTION_STEP_S = 0.1
+# Number of states that are predicted together.
+_BLOCK_ROWS = 1 << 11
 _PERIOD_NS = NS_PER_S // 10  # between two predictions, as in the published node
 
 
@@ -49,25 +51,34 @@ def displacements(run: Run, matching: Matching) -> TrackErrors:
         & confirmed(tracks)
         & np.isfinite(states).all(axis=1)
     )
-    stamps_ns = tracks["stamp_ns"][chosen]
-    objects = matching.object_index[chosen]
+    rows = np.flatnonzero(chosen)
     ahead_s: FloatArray = PREDICTION_STEP_S * np.arange(
         1, round(HORIZONS_S[-1] / PREDICTION_STEP_S) + 1, dtype=np.float64
     )
-    at_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
-    every = true_states(
-        run.tables["truth"], np.repeat(objects, len(ahead_s)), at_ns.reshape(-1)
-    )
-    truth = every[:, :2].reshape(*at_ns.shape, 2)
     road = roads(run)[0].get("track")
-    positions_m = {"arc": arc_positions(states[chosen], ahead_s)}
-    if road is not None:
-        positions_m["rail"] = rail_positions(road, states[chosen], ahead_s)
-    distances_m = {
-        name: np.asarray(np.linalg.norm(each - truth, axis=-1))
-        for name, each in positions_m.items()
-    }
-    return TrackErrors(stamps_ns, objects, tracks["track_id"][chosen], distances_m)
+    names = ("arc",) if road is None else ("arc", "rail")
+    distances_m = {name: np.empty((len(rows), len(ahead_s))) for name in names}
+    for begin in range(0, len(rows), _BLOCK_ROWS):
+        block = rows[begin : begin + _BLOCK_ROWS]
+        at_ns = tracks["stamp_ns"][block][:, None] + np.round(
+            ahead_s * NS_PER_S
+        ).astype(np.int64)
+        objects = np.repeat(matching.object_index[block], len(ahead_s))
+        every = states_of(matching.paths, objects, at_ns.reshape(-1))
+        truth = every[:, :2].reshape(*at_ns.shape, 2)
+        positions_m = {"arc": arc_positions(states[block], ahead_s)}
+        if road is not None:
+            positions_m["rail"] = rail_positions(road, states[block], ahead_s)
+        for name, each in positions_m.items():
+            distances_m[name][begin : begin + len(block)] = np.linalg.norm(
+                each - truth, axis=-1
+            )
+    return TrackErrors(
+        tracks["stamp_ns"][rows],
+        matching.object_index[rows],
+        tracks["track_id"][rows],
+        distances_m,
+    )
 
 
 def prediction_errors(

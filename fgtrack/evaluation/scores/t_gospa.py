@@ -15,41 +15,83 @@ from scipy.sparse.csgraph import connected_components
 
 from fgtrack.core.errors import FgtrackError
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.matching import Scenes
+from fgtrack.evaluation.scenes import NearPairs, Scenes
 
 __all__ = ["t_gospa"]
 
 SWITCH_M = 1.0
 """Default cost of a switch in m."""
+MOST_TICKS = 10_000
+"""Largest number of ticks of a run that is minimised as a whole."""
+WINDOW_TICKS = 2_000
+"""Number of ticks of a window of a longer run; the time of the linear program grows with the square."""
 
 
 def t_gospa(
     scenes: Scenes, c_m: float, switch_m: float = SWITCH_M
 ) -> Mapping[str, float]:
-    """Return T-GOSPA per tick, `rms_m`, and its squared parts per tick.
+    """Return T-GOSPA per tick, `rms_m`, its squared parts per tick, and the number of `windows`.
 
-    The parts are `localisation_m2`, `missed_m2`, `false_m2` and `switches_m2`. All
-    values are NaN without a tick. `c_m` is the cut-off distance and `switch_m` the cost
-    gamma of a switch. The metric minimises over the shares W_k(i, j) in [0, 1] of
-    object i that track j has at tick k:
+    The parts are `localisation_m2`, `missed_m2`, `false_m2` and `switches_m2`. All values
+    are NaN without a tick. `c_m` is the cut-off distance and `switch_m` the cost gamma of a
+    switch. The metric minimises over the shares W_k(i, j) in [0, 1] of object i that
+    track j has at tick k:
 
         sum of GOSPA^2(W_k) over k
         + gamma^2 / 2 times the sum of abs(W_k(i, j) - W_(k-1)(i, j)) over i, j, k
 
     A change from one track to another costs gamma^2. The start or the end of a pair
     costs gamma^2 / 2.
+
+    A run of more than `MOST_TICKS` ticks is cut into windows of `WINDOW_TICKS` ticks, and
+    the minimum is that of each window. No change between two windows is counted. Therefore
+    each cut lowers the sum by at most gamma^2 for each object.
     """
     num_ticks = len(scenes.present)
     names = ("localisation_m2", "missed_m2", "false_m2", "switches_m2")
     if not num_ticks:
-        return dict.fromkeys(("rms_m", *names), math.nan)
-    rows, objects = np.nonzero(scenes.distances_m < c_m)
-    ticks = scenes.tick_index[rows]
-    squares_m2 = np.square(scenes.distances_m[rows, objects])
-    pairs, pair_of_row = np.unique(
-        np.stack([objects, scenes.track_ids[rows]]), axis=1, return_inverse=True
+        return dict.fromkeys(("rms_m", *names, "windows"), math.nan)
+    scenes.near.check(c_m)
+    near = scenes.near.where(scenes.near.distances_m < c_m)
+    length = WINDOW_TICKS if num_ticks > MOST_TICKS else num_ticks
+    window = scenes.tick_index[near.rows] // length
+    parts = [
+        _assignment(scenes, near.where(window == number), c_m, switch_m)
+        for number in np.unique(window).tolist()
+    ]
+    localisation_m2, pairs, changes = np.sum(
+        np.reshape(parts, (-1, 3)), axis=0
+    ).tolist()
+    single_m2 = c_m**2 / 2.0
+    sums_m2 = (
+        localisation_m2,
+        single_m2 * (float(scenes.present.sum()) - pairs),
+        single_m2 * (float(len(scenes.tick_index)) - pairs),
+        0.5 * switch_m**2 * changes,
     )
-    shares = np.ones(len(rows))
+    per_tick = [part / num_ticks for part in sums_m2]
+    return {
+        "rms_m": math.sqrt(sum(per_tick)),
+        **dict(zip(names, per_tick, strict=True)),
+        "windows": math.ceil(num_ticks / length),
+    }
+
+
+def _assignment(
+    scenes: Scenes, near: NearPairs, c_m: float, switch_m: float
+) -> tuple[float, float, float]:
+    """Return the sums of squared distances, of shares and of changes of shares in one window.
+
+    `near` are the pairs of the window below `c_m`.
+    """
+    ticks = scenes.tick_index[near.rows]
+    squares_m2 = np.square(near.distances_m)
+    pairs, pair_of_row = np.unique(
+        np.stack([near.objects, scenes.track_ids[near.rows]]),
+        axis=1,
+        return_inverse=True,
+    )
+    shares = np.ones(len(near.rows))
     changes = 0.0
     for group in _competing_groups(pairs):
         mine = group[pair_of_row]
@@ -63,18 +105,7 @@ def t_gospa(
         found = _shares(sums_m2, pairs[:, group], switch_m)
         shares[mine] = found[stretch[at], column]
         changes += float(np.abs(np.diff(found, axis=0)).sum())
-    single_m2 = c_m**2 / 2.0
-    parts = (
-        float(shares @ squares_m2),
-        single_m2 * float(scenes.present.sum() - shares.sum()),
-        single_m2 * float(len(scenes.tick_index) - shares.sum()),
-        0.5 * switch_m**2 * changes,
-    )
-    per_tick = [part / num_ticks for part in parts]
-    return {
-        "rms_m": math.sqrt(sum(per_tick)),
-        **dict(zip(names, per_tick, strict=True)),
-    }
+    return float(shares @ squares_m2), float(shares.sum()), changes
 
 
 def _competing_groups(pairs: IntArray) -> list[BoolArray]:

@@ -26,7 +26,7 @@ from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
 from fgtrack.evaluation.tables.verdict import who_is_best
-from fgtrack.evaluation.truth import true_states
+from fgtrack.evaluation.truth import states_of
 from fgtrack.runs import Node, Run, ready_times
 
 #: Ways to evaluate a state: at its own stamp; as published, when it was ready; predicted by its user to that time.
@@ -44,15 +44,16 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
     tracks = matching.tracks.where(matching.paired)
     object_index = matching.object_index[rows]
     ready_ns = _ready(run)[0][matching.tick_index[rows]]
-    truth = true_states(run.tables["truth"], object_index, ready_ns)[:, :2]
+    truth = states_of(matching.paths, object_index, ready_ns)[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
     moved = published + np.nan_to_num(
         cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1))
     )
     known = np.isfinite(truth[:, 0])
+    at_stamp = published - matching.true_states[rows, :2]
     values = {
-        ASKED: matching.distances_m[rows, object_index][known],
+        ASKED: np.linalg.norm(at_stamp, axis=-1)[known],
         READY: np.linalg.norm(published - truth, axis=-1)[known],
         PREDICTED: np.linalg.norm(moved - truth, axis=-1)[known],
     }
