@@ -16,7 +16,7 @@ TEST := $(VENV)/.test
 DEV := $(TEST) $(VENV)/.dev
 DOCS := $(TEST) $(VENV)/.docs
 
-.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz fuzz-values faults coverage mutants check docs picture bench bench-full soak soak-live fairness clean
+.PHONY: demo loops test test-fast test-slow test-matrix lock audit fuzz fuzz-values faults coverage mutants check docs picture bench bench-full soak soak-live fairness clean
 
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -25,9 +25,11 @@ demo: $(RUN)
 LOOPS = $(shell grep -rl -e '^@njit.' -e '^@shared.' --include='*.py' fgtrack | LC_ALL=C sort | sed 's/\.py$$//; s|/|.|g')
 SMOOTHER_LOOPS = $(filter fgtrack.estimation.smoothing.%,$(LOOPS))
 IMPORTED = $(foreach module,$(1),import $(module);)
-test: $(TEST)
+loops: $(TEST)
 	@$(BIN)/python -c '$(call IMPORTED,$(filter-out $(SMOOTHER_LOOPS),$(LOOPS)))' & \
 	    $(BIN)/python -c '$(call IMPORTED,$(SMOOTHER_LOOPS))'; wait
+
+test: loops
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests of the core: within a minute of processor time.
@@ -65,7 +67,7 @@ check: $(DEV)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(DOCS)
+docs: $(DOCS) loops
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
 
 # The imports between the folders, for docs/architecture.md.

@@ -1,20 +1,28 @@
 """ASTERIX recordings, made with libasterix."""
 
 import math
+from importlib import import_module
+from importlib.util import find_spec
 
 import pytest
 
-gen = pytest.importorskip(
-    "asterix.generated", reason="libasterix is not installed (extra `asterix`)"
+from fgtrack.core.errors import DataError
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.formats.asterix_records import RecordReader
+from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin
+from fgtrack.inputs.source import input_kind, open_input
+
+pytestmark = pytest.mark.skipif(
+    find_spec("asterix") is None,
+    reason="libasterix is not installed (extra `asterix`)",
 )
 
-from fgtrack.core.errors import DataError  # noqa: E402
-from fgtrack.inputs.errors import UntilBreak  # noqa: E402
-from fgtrack.inputs.formats.asterix_records import RecordReader  # noqa: E402
-from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin  # noqa: E402
-from fgtrack.inputs.source import input_kind, open_input  # noqa: E402
-
 AIRPORT = Origin(41.3, 2.08)
+
+
+def edition(name):
+    """An edition of a category. The module takes seconds to load, so no other test file loads it."""
+    return getattr(import_module("asterix.generated"), name)
 
 
 def block(kind, *records):
@@ -38,7 +46,7 @@ def surface(time_s, x_m, y_m, kind=3, address=None, sic=7, coasted=0):
         "202": (("VX", 12), ("VY", 16)),
     }  # in 0.25 m/s
     return block(
-        gen.Cat_010_1_1,
+        edition("Cat_010_1_1"),
         {**head, "020": ((("TYP", kind), 0, 0, 0, 0, None),), **where, **target},
     )
 
@@ -48,13 +56,13 @@ def aircraft(
     sent_s,
     latitude,
     longitude,
-    kind=gen.Cat_021_2_6,
+    kind="Cat_021_2_6",
     nacp=9,
     address=0x4CACAA,
 ):
     quality = ((0, 7, None), (0, 0, nacp, None))
     return block(
-        kind,
+        edition(kind),
         {
             "010": (("SAC", 0), ("SIC", 1)),
             "080": address,
@@ -263,7 +271,7 @@ def test_numbers_behind_compound_extended_and_repeated_items_are_those_of_the_li
         "136": (100.0, "FL"),
         "510": [(1, 2), (3, 4)],
     }
-    raw = block(gen.Cat_062_1_21, record, record)
+    raw = block(edition("Cat_062_1_21"), record, record)
     names = [
         "070",
         "105/LAT",
@@ -274,8 +282,8 @@ def test_numbers_behind_compound_extended_and_repeated_items_are_those_of_the_li
         "136",
         "290/SSR",
     ]
-    both = list(RecordReader(gen.Cat_062_1_21, names, {})(raw[3:]))
-    (own, _) = gen.Cat_062_1_21.cv_uap.parse(Bits.from_bytes(raw[3:]))
+    both = list(RecordReader(edition("Cat_062_1_21"), names, {})(raw[3:]))
+    (own, _) = edition("Cat_062_1_21").cv_uap.parse(Bits.from_bytes(raw[3:]))
     expected = {}
     for name in names:
         item, _, part = name.partition("/")

@@ -29,6 +29,14 @@ def messages() -> list[Message]:
 
 
 @pytest.fixture(scope="module")
+def short() -> list[Message]:
+    """As `messages`, where the numbers do not matter."""
+    return simulate(
+        replace(read_scenario("default"), duration_s=4.0), np.random.default_rng(2)
+    )
+
+
+@pytest.fixture(scope="module")
 def karle(messages: list[Message]) -> Ledger:
     return ledger(
         messages, read_config("karle2023", **MAPS), read_config("tuned", **MAPS)
@@ -99,19 +107,19 @@ def test_a_wrong_clock_has_a_part(messages: list[Message]) -> None:
     )
 
 
-def test_settings_and_maps_are_those_of_replay(messages: list[Message]) -> None:
+def test_settings_and_maps_are_those_of_replay(short: list[Message]) -> None:
     given = ledger(
-        messages, "tuned", map="oval", pit_map="oval", set={"estimator": "ekf-replay"}
+        short, "tuned", map="oval", pit_map="oval", set={"estimator": "ekf-replay"}
     )
     assert str(given) == str(
-        ledger(messages, read_config("tuned", estimator="ekf-replay", **MAPS))
+        ledger(short, read_config("tuned", estimator="ekf-replay", **MAPS))
     )
 
 
 def test_advice_has_the_table_where_it_is_asked_for(
-    messages: list[Message], tmp_path: Path
+    short: list[Message], tmp_path: Path
 ) -> None:
-    write_stream(tmp_path / "drive.jsonl", messages)
+    write_stream(tmp_path / "drive.jsonl", short)
     config = read_config("tuned", estimator="ekf-replay", **MAPS)
     advice = fgtrack.advise(tmp_path / "drive.jsonl", config, ledger=True)
     names = [row["estimator"] for row in advice.tables.tables["ledger"].records]
@@ -143,9 +151,9 @@ def test_the_replaying_filter_has_the_error_of_its_own_run(
     ]
 
 
-def test_nobody_late_means_no_part_of_lateness(messages: list[Message]) -> None:
+def test_nobody_late_means_no_part_of_lateness(short: list[Message]) -> None:
     result = ledger(
-        prompt(messages), read_config("smoother", estimator="ekf-replay", **MAPS)
+        prompt(short), read_config("smoother", estimator="ekf-replay", **MAPS)
     )
     assert result.waterfall[-1].share_m2.mean == pytest.approx(0.0, abs=1e-12)
     assert all(
@@ -217,7 +225,7 @@ def test_a_recording_without_tracks_has_no_ledger() -> None:
 
 def test_a_run_folder_stands_for_its_recording(tmp_path: Path) -> None:
     recording = fgtrack.simulate(
-        "default", duration_s=6.0, seed=1, out=tmp_path / "drive.jsonl"
+        "default", duration_s=3.0, seed=1, out=tmp_path / "drive.jsonl"
     )
     fgtrack.replay(recording, "smoother", estimator="ekf-replay", out=tmp_path / "run")
     assert str(ledger(tmp_path / "run")) == str(
@@ -237,8 +245,8 @@ def test_the_figure_names_every_part(karle: Ledger) -> None:
     ]
 
 
-def test_sensors_need_no_configuration(messages: list[Message]) -> None:
-    assert math.isfinite(ledger(messages).waterfall[0].mean_square_m2)
+def test_sensors_need_no_configuration(short: list[Message]) -> None:
+    assert math.isfinite(ledger(short).waterfall[0].mean_square_m2)
 
 
 def test_a_run_folder_without_its_recording_says_so(tmp_path: Path) -> None:
