@@ -170,7 +170,7 @@ def simulate(
     resolved = read_scenario(scenario, duration_s=duration_s)
     messages = simulated(resolved, np.random.default_rng(seed))
     if out is None:
-        return iter(messages)
+        return messages
     write_recording(
         Path(out),
         messages,

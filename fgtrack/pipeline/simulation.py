@@ -1,5 +1,6 @@
 """Simulates scenarios, whose vehicles may follow the paths of recorded objects."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,15 @@ from fgtrack.core.types import EGO_ID, EgoState, Message, TruthState
 from fgtrack.meaning.draft import opened
 from fgtrack.sim.roads import RecordedVehicle, TimedPath, csv_path, timed_path
 from fgtrack.sim.scenario import Scenario
-from fgtrack.sim.simulate import simulate
+from fgtrack.sim.simulate import message_stream
 
 
-def simulated(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
-    """Return the messages of `scenario`, see `fgtrack.sim.simulate.simulate`.
+def simulated(scenario: Scenario, rng: np.random.Generator) -> Iterator[Message]:
+    """Return the messages of `scenario`, see `fgtrack.sim.simulate.message_stream`.
 
     Raises `DataError` also if a recording cannot be read, or has no path of the object.
     """
-    return simulate(scenario, rng, recorded_path)
+    return message_stream(scenario, rng, recorded_path)
 
 
 def path_files(scenario: Scenario) -> list[str]:

@@ -238,9 +238,8 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
         rng = np.random.default_rng(recipe["seed"])
         problem = None
         if recipe["recording"] is None:
-            messages = simulated(
-                validate(Scenario, recipe["scenario"], "scenario"), rng
-            )
+            scenario = validate(Scenario, recipe["scenario"], "scenario")
+            messages = list(simulated(scenario, rng))
         else:
             draft = opened(recipe["recording"], config)
             source = draft.source

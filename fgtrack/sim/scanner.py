@@ -3,8 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -41,6 +40,38 @@ def _joined(parts: Sequence[_Detected]) -> _Detected:
 
 
 @dataclass(frozen=True, eq=False)
+class Scans(Sequence[tuple[Detection, ...]]):
+    """Detections of n scans; those of a scan are made when it is used."""
+
+    components: tuple[str, ...]
+    """Names of the measured values."""
+    z: FloatArray
+    """Measured values of all detections by ascending scan, shape (m, k)."""
+    edges: IntArray
+    """First detection of each scan, and the number of detections, shape (n + 1,)."""
+
+    def __len__(self) -> int:
+        return len(self.edges) - 1
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[Detection, ...]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[tuple[Detection, ...]]: ...
+
+    def __getitem__(
+        self, index: int | slice
+    ) -> tuple[Detection, ...] | list[tuple[Detection, ...]]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        k = range(len(self))[index]
+        rows = self.z[self.edges[k] : self.edges[k + 1]].tolist()
+        return tuple(
+            Detection(**dict(zip(self.components, row, strict=True))) for row in rows
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Scanner:
     """Simulates one sensor on the ego; `ego`, shape (n, 6), contains the ego's states at the sensor's n scans."""
 
@@ -54,7 +85,7 @@ class Scanner:
         rng: np.random.Generator,
         objects: Sequence[FloatArray],
         track: TrackMap | None,
-    ) -> list[tuple[Detection, ...]]:
+    ) -> Scans:
         """Return the detections of the n scans.
 
         `objects` contains the states of each object at the scans, shape (n, 6). Every
@@ -68,15 +99,8 @@ class Scanner:
         ]
         detected = _joined([self._clutter(clutter_rng, track), *seen])
         order = np.lexsort((detected.key, detected.scan))
-        rows = detected.z[order].tolist()
-        detections = [
-            Detection(**dict(zip(self.sensor.components, row, strict=True)))
-            for row in rows
-        ]
-        bounds = np.searchsorted(
-            detected.scan[order], np.arange(len(self.ego) + 1)
-        ).tolist()
-        return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
+        edges = np.searchsorted(detected.scan[order], np.arange(len(self.ego) + 1))
+        return Scans(self.sensor.components, detected.z[order], edges)
 
     def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
         """Detect one object: in each scan none, one or, for a split object, two detections."""

@@ -1,8 +1,9 @@
 """Simulates the messages that a tracker would receive in a scenario."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from heapq import merge
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
     EGO_COVARIANCE_STATES,
     EGO_ID,
+    STATE_NAMES,
     YAW,
     BoolArray,
     DetectionList,
@@ -39,6 +41,8 @@ from fgtrack.sim.vehicles import DrawnVehicle
 
 States = Callable[[FloatArray], FloatArray]
 """Returns the true states of a vehicle, shape (n, 6), at times since the start, shape (n,); NaN while it is absent."""
+#: Number of stamps whose true states are computed together.
+_BLOCK = 256
 PathReader = Callable[[RecordedVehicle], TimedPath]
 """Reads the path of a recorded vehicle."""
 
@@ -52,6 +56,13 @@ def _no_paths(vehicle: RecordedVehicle) -> TimedPath:
 def simulate(
     scenario: Scenario, rng: np.random.Generator, read_path: PathReader = _no_paths
 ) -> list[Message]:
+    """Return the messages of `message_stream` as a list."""
+    return list(message_stream(scenario, rng, read_path))
+
+
+def message_stream(
+    scenario: Scenario, rng: np.random.Generator, read_path: PathReader = _no_paths
+) -> Iterator[Message]:
     """Return the messages of `scenario` in order of receipt; at equal receipts the truth, the ego, then the sensors.
 
     Every vehicle and every sensor has its own random generators. A sensor has separate
@@ -60,6 +71,9 @@ def simulate(
     clock model changes the reported stamp, never the measurement. Lost messages are
     left out, and so is a vehicle before and after its recorded path. `read_path` reads
     recorded paths.
+
+    All numbers of the ego and of the sensors are drawn at the start. The messages are
+    made when they are used: their objects would take ten times the memory.
 
     Raises `DataError` if the map or a path cannot be read, and if the ego's recorded path
     does not cover the whole duration.
@@ -81,16 +95,16 @@ def simulate(
             f"ego: its recorded path must cover the scenario from 0 to {scenario.duration_s:g} s, "
             "change start_s or duration_s"
         )
-    messages: list[Message] = [
-        *_truth(scenario, [ego, *opponents]),
-        *_ego_messages(scenario, ego, ego_rng),
+    children = sensors_rng.spawn(len(scenario.sensors))
+    sources = [
+        _truth(scenario, [ego, *opponents]),
+        _ego_messages(scenario, ego, ego_rng),
+        *(
+            _scans(scenario, sensor, ego, opponents, track, child)
+            for sensor, child in zip(scenario.sensors, children, strict=True)
+        ),
     ]
-    for sensor, child in zip(
-        scenario.sensors, sensors_rng.spawn(len(scenario.sensors)), strict=True
-    ):
-        messages += _scans(scenario, sensor, ego, opponents, track, child)
-    messages.sort(key=lambda message: message.receipt_ns)
-    return messages
+    return merge(*sources, key=lambda message: message.receipt_ns)
 
 
 def _states_of(
@@ -110,20 +124,22 @@ def _states_of(
     return partial(vehicle.states, path)
 
 
-def _truth(scenario: Scenario, vehicles: Sequence[States]) -> list[Message]:
+def _truth(scenario: Scenario, vehicles: Sequence[States]) -> Iterator[Message]:
+    """Yield the truth by ascending stamp; the states are computed in blocks."""
     stamps_ns, times_s = _stamps(scenario, scenario.truth_rate_hz)
-    rows = [vehicle(times_s).tolist() for vehicle in vehicles]
-    return [
-        TruthState(stamp_ns, stamp_ns, object_id, *states[index])
-        for index, stamp_ns in enumerate(stamps_ns.tolist())
-        for object_id, states in enumerate(rows, start=EGO_ID)
-        if not math.isnan(states[index][0])
-    ]
+    for first in range(0, len(stamps_ns), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        rows = [vehicle(times_s[block]).tolist() for vehicle in vehicles]
+        for index, stamp_ns in enumerate(stamps_ns[block].tolist()):
+            for object_id, states in enumerate(rows, start=EGO_ID):
+                if not math.isnan(states[index][0]):
+                    yield TruthState(stamp_ns, stamp_ns, object_id, *states[index])
 
 
 def _ego_messages(
     scenario: Scenario, ego: States, rng: np.random.Generator
-) -> list[Message]:
+) -> Iterator[Message]:
+    """Draw the states of the ego, and return its messages by ascending receipt."""
     settings = scenario.ego_messages
     noise_rng, delay_rng = rng.spawn(2)
     stamps_ns, times_s = _stamps(scenario, settings.rate_hz)
@@ -135,16 +151,16 @@ def _ego_messages(
     receipts_ns, lost = _receipts(settings.delay, delay_rng, stamps_ns, times_s)
     variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
     covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
-    columns = zip(
-        stamps_ns[~lost].tolist(),
-        receipts_ns[~lost].tolist(),
-        states[~lost].tolist(),
-        strict=True,
+    return (
+        EgoState(
+            int(stamps_ns[row]),
+            int(receipts_ns[row]),
+            **dict(zip(STATE_NAMES, states[row].tolist(), strict=True)),
+            in_pit=None,
+            covariance=covariance,
+        )
+        for row in _by_receipt(receipts_ns, lost)
     )
-    return [
-        EgoState(stamp_ns, receipt_ns, *row, in_pit=None, covariance=covariance)  # type: ignore[misc]  # six in a row
-        for stamp_ns, receipt_ns, row in columns
-    ]
 
 
 def _scans(
@@ -154,7 +170,8 @@ def _scans(
     opponents: Sequence[States],
     track: TrackMap | None,
     rng: np.random.Generator,
-) -> list[Message]:
+) -> Iterator[Message]:
+    """Draw the detections of `sensor`, and return its messages by ascending receipt."""
     times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
     stamps_ns, times_s = _stamps(
         scenario, sensor.scan_times(times_rng, scenario.duration_s)
@@ -165,18 +182,24 @@ def _scans(
     )
     receipts_ns, lost = _receipts(sensor.delay, delay_rng, stamps_ns, times_s)
     reported_ns = reported_stamps(sensor.clock, clock_rng, stamps_ns, receipts_ns)
-    columns = zip(
-        reported_ns.tolist(),
-        receipts_ns.tolist(),
-        scans,
-        lost | sensor.silent(times_s),
-        strict=True,
+    is_missing = lost | sensor.silent(times_s)
+    return (
+        DetectionList(
+            sensor.name,
+            int(reported_ns[row]),
+            int(receipts_ns[row]),
+            scans[row],
+            sensor.frame,
+        )
+        for row in _by_receipt(receipts_ns, is_missing)
     )
-    return [
-        DetectionList(sensor.name, stamp_ns, receipt_ns, detections, sensor.frame)
-        for stamp_ns, receipt_ns, detections, is_missing in columns
-        if not is_missing
-    ]
+
+
+def _by_receipt(receipts_ns: IntArray, is_missing: BoolArray) -> Iterator[int]:
+    """Yield the rows of the messages that are not missing, by ascending receipt, in their order at equal receipts."""
+    order = np.argsort(receipts_ns, kind="stable")
+    for row in order[~is_missing[order]]:
+        yield int(row)
 
 
 def _stamps(

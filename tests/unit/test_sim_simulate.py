@@ -1,3 +1,6 @@
+import tracemalloc
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +13,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.sim.delays import NoDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
-from fgtrack.sim.simulate import simulate
+from fgtrack.sim.simulate import message_stream, simulate
 from fgtrack.sim.vehicles import DrawnVehicle, TrackVehicle
 
 DEFAULT = read_scenario("default")
@@ -156,3 +159,28 @@ def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
         "radar",
         "lidar",
     ]
+
+
+def test_blocks_of_the_truth_do_not_change_a_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scenario = replace(read_scenario("race"), duration_s=1.5)
+    messages = simulate(scenario, np.random.default_rng(3))
+    monkeypatch.setattr("fgtrack.sim.simulate._BLOCK", 7)
+    assert simulate(scenario, np.random.default_rng(3)) == messages
+
+
+def test_a_stream_makes_its_messages_when_they_are_used() -> None:
+    """The messages of a stream take less than half of the memory of the list."""
+
+    def peak_bytes(used: Callable[[Iterator[Message]], object]) -> int:
+        tracemalloc.start()
+        used(message_stream(scenario, np.random.default_rng(0)))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    scenario = replace(read_scenario("race"), duration_s=60.0)
+    peak_bytes(list)  # imports modules
+    consumed = peak_bytes(lambda messages: deque(messages, maxlen=0))
+    assert consumed < 0.5 * peak_bytes(list)
