@@ -41,11 +41,12 @@ class LocalPlane:
     Without a given origin, the first position becomes the origin.
     """
 
-    def __init__(self, origin: Origin | None = None) -> None:
+    def __init__(self, origin: Origin | None = None, *, warns: bool = True) -> None:
+        """`warns`: log a warning on positions that are far from the origin."""
         self.origin = origin
         self._num_near = 0
         self._num_far = 0
-        self._warned = False
+        self._warned = not warns
 
     @property
     def origin_deg(self) -> tuple[float, float] | None:

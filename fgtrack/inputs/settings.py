@@ -39,6 +39,11 @@ class Field:
     """True if the result is in degrees and is to be converted to radians."""
     unknown: tuple[float, ...] = ()
     """Recorded numbers that mean "unknown", for example `[102.3]` for a speed in AIS tables; the value is missing."""
+    least: Mapping[str, float] = field(default_factory=dict)
+    """Least recorded numbers of other fields with which the value counts, by path; otherwise it is missing.
+
+    `{SOG: 1}`: the course of a ship is random at rest, so it counts from 1 knot.
+    """
 
     def value(self, raw: float) -> float:
         """Return the converted number."""

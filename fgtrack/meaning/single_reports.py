@@ -13,7 +13,7 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
-__all__ = ["NO_ID", "SingleReports", "Trend", "single_reports"]
+__all__ = ["NO_ID", "SingleReports", "Trend", "links_of_ids", "single_reports"]
 
 NO_ID = -1
 """Number of a report without an identity."""
@@ -98,7 +98,7 @@ def single_reports(
     order = np.argsort(times_s, kind="stable")[:_MOST_REPORTS]
     times_s, points_m, sights_m = times_s[order], points_m[order], sights_m[order]
     ids, velocities = ids[order], velocities[order]
-    firsts, seconds = _links_of_ids(times_s, points_m, ids)
+    firsts, seconds = links_of_ids(times_s, points_m, ids)
     by_id = len(firsts) >= _FEWEST
     if not by_id and revisit_s is not None:
         firsts, seconds = _nearest_links(times_s, points_m, revisit_s)
@@ -128,11 +128,12 @@ def single_reports(
     return result
 
 
-def _links_of_ids(
+def links_of_ids(
     times_s: FloatArray, points_m: FloatArray, ids: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Return the indices of successive reports of each identity, (m,) each; empty if identities do not inform.
 
+    `times_s` (n,) ascend, `points_m` are (n, 2), and `ids` (n,) are numbers, or `NO_ID`.
     Equal identities inform if nearly all objects could travel from each report to the next.
     Copies of a report are left out.
     """

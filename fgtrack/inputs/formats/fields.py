@@ -126,7 +126,7 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
     present = [value for value in numbers if value is not None]
     if len(present) < len(numbers):
         return None
-    if isinstance(path, Field) and any(each in path.unknown for each in present):
+    if isinstance(path, Field) and not _counts(path, present, read):
         return None
     if name == "yaw_rad" and len(present) == 4:
         raw = yaw_of(*present)
@@ -139,6 +139,17 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
     if wraps and name in ANGULAR and math.isfinite(value):
         return wrap_angle(value)
     return value
+
+
+def _counts(path: Field, numbers: Sequence[float], read: Callable[[str], Any]) -> bool:
+    """True if the `numbers` at `path` are known, and its other fields have their least numbers."""
+    if any(each in path.unknown for each in numbers):
+        return False
+    others = {name: _float(read(name), name) for name in path.least}
+    return all(
+        value is not None and value >= path.least[name]
+        for name, value in others.items()
+    )
 
 
 def _float(value: Any, path: str) -> float | None:

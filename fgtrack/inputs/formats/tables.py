@@ -51,7 +51,7 @@ from fgtrack.inputs.formats.table_times import (
 )
 from fgtrack.inputs.formats.time_outliers import WRONG_TIME
 from fgtrack.inputs.geodetic import GEODETIC, LocalPlane, warn_once
-from fgtrack.inputs.settings import CsvTable, InputConfig
+from fgtrack.inputs.settings import CsvTable, Field, InputConfig
 from fgtrack.inputs.source import FileFormat
 from fgtrack.inputs.stream import PACKED_TABLES
 
@@ -159,7 +159,13 @@ def _read(
 def _check_columns(table: CsvTable, header: Cells, where: str) -> None:
     """Raise `DataError` if `header` lacks a column of `table`."""
     mapped_columns = chain.from_iterable(map(paths_of, table.columns.values()))
-    for column in [*mapped_columns, *table.filters]:
+    conditions = [
+        column
+        for path in table.columns.values()
+        if isinstance(path, Field)
+        for column in path.least
+    ]
+    for column in [*mapped_columns, *conditions, *table.filters]:
         if column not in header:
             raise DataError(
                 f"{where}: has no column {column!r}; its columns are {', '.join(header)}"
