@@ -46,7 +46,7 @@ def write_geojson(run: Run, out: Path, *, overwrite: bool = False) -> int:
     if out.suffix == ".csv":
         import pandas
 
-        frame = pandas.DataFrame(tracks).assign(
+        frame = pandas.DataFrame(dict(tracks)).assign(
             latitude_deg=latitude_deg, longitude_deg=longitude_deg
         )
         with new_path(out, overwrite) as path:
