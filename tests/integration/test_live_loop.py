@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.reader import make_reader
 from support.scripts import EXPERIMENTS, LIVE, load_file
 
 import fgtrack
@@ -102,6 +104,32 @@ def test_the_drive_of_the_loop_keeps_the_stamps_of_the_simulation() -> None:
         m.stamp_ns - sent[0].stamp_ns for m in sent
     ]
     assert all(m.receipt_ns >= m.stamp_ns for m in drive)
+
+
+def test_tracks_are_boxes_in_foxglove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    foxglove = pytest.importorskip("foxglove")
+    monkeypatch.syspath_prepend(LIVE)
+    script = load_file(LIVE / "foxglove_tracks.py", "live")
+    state = fgtrack.TrackState(1_500_000_000, np.array([3.0, 4, 0, 20, 0]), np.eye(5))
+    tracks = [
+        fgtrack.TrackReport(k, status, state, 5)
+        for k, status in enumerate(fgtrack.TrackStatus)
+    ]
+    server = foxglove.start_server(port=0)
+    with foxglove.open_mcap(tmp_path / "tracks.mcap"):
+        script.publish(state.stamp_ns, tuple(tracks))
+        script.publish(state.stamp_ns + 20_000_000, ())
+    server.stop()
+    with open(tmp_path / "tracks.mcap", "rb") as file:
+        sent = list(make_reader(file).iter_messages(topics=["/tracks"]))
+    assert [message.log_time for _, _, message in sent] == [
+        1_500_000_000,
+        1_520_000_000,
+    ]
+    assert b"2: 20 m/s" in sent[0][2].data
+    assert len(sent[1][2].data) == 0
 
 
 @pytest.mark.slow

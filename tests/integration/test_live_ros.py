@@ -1,19 +1,28 @@
-"""The ROS 2 node of docs/live, on stand-ins for rclpy, tf2_ros and the messages."""
+"""The ROS 2 node of ros2/fgtrack_ros, on stand-ins for rclpy, tf2_ros and the messages."""
 
+import gc
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
-from support.scripts import LIVE, load_file
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from ruamel.yaml import YAML
+from support.scripts import ROOT, load_file
 
+import fgtrack
+from fgtrack.inputs.ros.bag_writer import write_bag
 from fgtrack.inputs.ros.typestore import typestore_of
+
+PACKAGE = ROOT / "ros2/fgtrack_ros"
 
 MS = 1_000_000
 NOW_NS = 1_700_000_000_000_000_000
@@ -32,11 +41,19 @@ TYPES = (
         "geometry_msgs/msg/TransformStamped",
         "builtin_interfaces/msg/Time",
     ),
+    *(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        "diagnostic_msgs/msg/KeyValue",
+        "autoware_perception_msgs/msg/DetectedObjects",
+        "autoware_perception_msgs/msg/DetectedObject",
+        "autoware_perception_msgs/msg/ObjectClassification",
+    ),
 )
 STORE = typestore_of(TYPES)
 
 
-# --- stand-ins for rclpy, tf2_ros and message packages: what docs/live/ros_node.py uses of them
+# --- stand-ins for rclpy, tf2_ros and message packages: what the node uses of them
 
 
 def _default(kind: Any, what: Any) -> Any:
@@ -199,6 +216,10 @@ STAND_INS: Mapping[str, Mapping[str, Any]] = {
     },
     "nav_msgs": {},
     "nav_msgs.msg": messages_of("nav_msgs"),
+    "diagnostic_msgs": {},
+    "diagnostic_msgs.msg": messages_of("diagnostic_msgs"),
+    "autoware_perception_msgs": {},
+    "autoware_perception_msgs.msg": messages_of("autoware_perception_msgs"),
     "vision_msgs": {},
     "vision_msgs.msg": messages_of("vision_msgs"),
 }
@@ -210,7 +231,10 @@ def script() -> Iterator[ModuleType]:
         for name, members in STAND_INS.items():
             patch.setitem(sys.modules, name, ModuleType(name))
             vars(sys.modules[name]).update(members)
-        yield load_file(LIVE / "ros_node.py", "live")
+        patch.setattr(
+            gc, "freeze", lambda: None
+        )  # the other tests of this process want their garbage collected
+        yield load_file(PACKAGE / "fgtrack_ros/node.py", "ros2")
 
 
 def made(script: ModuleType, **parameters: Any) -> Any:
@@ -344,3 +368,158 @@ def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
         Time.from_msg(published.header.stamp).nanoseconds,
     ) == ([], NOW_NS - 5_000 * MS)
     assert (counts(node), node.tracker.refused, node.buffer.known) == ({}, {}, {})
+
+
+def test_a_bag_through_the_node_gives_the_tracks_of_its_replay(
+    script: ModuleType, tmp_path: Path
+) -> None:
+    """The recorded messages go in as bytes, and the tracks come out as bytes of another bag."""
+    drive = fgtrack.simulate("single_opponent", seed=1, duration_s=4.0)
+    write_bag(tmp_path / "in", drive)
+    sensors = ("lidar_cluster", "radar")
+    topics = {f"/detections/{sensor}": f"{sensor}/detections" for sensor in sensors}
+    reads = {sensor: {"topic": f"/detections/{sensor}"} for sensor in sensors}
+    settings = {"input.ego": {"topic": "/ego/odometry"}, "input.detections": reads}
+    config = fgtrack.Config.from_yaml("smoother").replace(
+        {**settings, "map.track": "oval", "estimator": "ekf-replay"}
+    )
+    config.to_yaml(tmp_path / "config.yaml")
+    run = fgtrack.replay(tmp_path / "in", config)
+    node = made(script, config=str(tmp_path / "config.yaml"), ego_from_odometry=True)
+    received = list(recorded(tmp_path / "in", {**topics, "/ego/odometry": "odometry"}))
+    for now_ns in run.timing["now_ns"]:
+        while received and received[0][0] <= now_ns:
+            receipt_ns, topic, message = received.pop(0)
+            send(node, topic, message, receipt_ns)
+        tick(node, int(now_ns))
+    node.timers[1]()
+    keep(tmp_path / "out", node.published)
+    found = [
+        (Time.from_msg(message.header.stamp).nanoseconds, int(one.id), *at(one))
+        for _, _, message in recorded(tmp_path / "out", {"/tracks": "tracks"})
+        for one in message.detections
+    ]
+    rows = run.tracks[["now_ns", "track_id", "x_m", "y_m", "yaw_rad"]]
+    expected = sorted(rows.itertuples(index=False, name=None))
+    assert len(expected) > 100
+    np.testing.assert_allclose(sorted(found), expected, rtol=0.0, atol=1e-9)
+    assert (node.tracker.refused, node.tracker.failures) == ({}, {})
+    [(_, _, diagnostics)] = recorded(tmp_path / "out", {"/diagnostics": "diagnostics"})
+    names = [status.name for status in diagnostics.status]
+    assert names[0] == "fgtrack"
+    assert {"fgtrack: radar", "fgtrack: lidar_cluster", "fgtrack: ego"} <= set(names)
+    of_radar = diagnostics.status[names.index("fgtrack: radar")]
+    values = {each.key: each.value for each in of_radar.values}
+    assert float(values["NIS per component"]) > 0.0
+
+
+def at(detection: Any) -> tuple[float, float, float]:
+    centre = detection.bbox.center
+    turned = centre.orientation
+    return (
+        centre.position.x,
+        centre.position.y,
+        2.0 * math.atan2(turned.z, turned.w),
+    )
+
+
+def recorded(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[int, str, Any]]:
+    """Receipt, other name of the topic and message of each message of a bag."""
+    with Reader(path) as bag:
+        chosen = [each for each in bag.connections if each.topic in topics]
+        for connection, receipt_ns, data in bag.messages(chosen):
+            message = STORE.deserialize_cdr(data, connection.msgtype)
+            yield receipt_ns, topics[connection.topic], message
+
+
+def keep(path: Path, published: Mapping[str, list[Any]]) -> None:
+    """Write what a node has published into a bag; a byte is a number there."""
+    kinds = {
+        "tracks": "vision_msgs/msg/Detection3DArray",
+        "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    }
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        for topic, messages in published.items():
+            connection = bag.add_connection(
+                f"/{topic.lstrip('/')}", kinds[topic], typestore=STORE
+            )
+            for message in messages:
+                for status in getattr(message, "status", []):
+                    status.level = status.level[0]
+                stamp_ns = Time.from_msg(message.header.stamp).nanoseconds
+                data = STORE.serialize_cdr(message, kinds[topic])
+                bag.write(connection, stamp_ns, data)
+
+
+def test_lists_of_autoware_have_speeds(script: ModuleType) -> None:
+    node = made(script, sensors=[""], autoware_sensors=["radar"])
+    node.buffer.known = {NOW_NS + k * MS: pose(NOW_NS + k * MS) for k in (0, 500)}
+    message = message_class("autoware_perception_msgs/msg/DetectedObjects")()
+    car = message_class("autoware_perception_msgs/msg/DetectedObject")()
+    message.header.stamp, message.header.frame_id = Time(NOW_NS).to_msg(), "base_link"
+    car.kinematics.pose_with_covariance.pose.position.x = 40.0
+    car.kinematics.twist_with_covariance.twist.linear.x = 20.0
+    car.kinematics.has_twist = True
+    message.objects = [car]
+    send(node, "radar/objects", message, NOW_NS + 20 * MS)
+    [track] = tick(node, NOW_NS + 40 * MS).detections
+    assert counts(node) == {"radar": {"birth": 1}}
+    [report] = node.tracker.tracks_at(NOW_NS + 40 * MS)
+    assert report.speed_mps == pytest.approx(20.0, abs=0.5)
+    assert track.bbox.center.position.x == pytest.approx(40.0, abs=4.0)
+
+
+def test_a_node_that_restarts_goes_on_with_its_tracks(
+    script: ModuleType, tmp_path: Path
+) -> None:
+    path = tmp_path / "state"
+    nodes = [made(script, state_file=str(path))]
+    nodes[0].buffer.known = {NOW_NS + k * MS: pose(NOW_NS + k * MS) for k in (0, 500)}
+    send(nodes[0], "radar/detections", detections(NOW_NS), NOW_NS + 20 * MS)
+    tick(nodes[0], NOW_NS + 40 * MS)
+    nodes[0].timers[2]()
+    nodes.append(made(script, state_file=str(path)))
+    tracks = [tick(node, NOW_NS + 60 * MS).detections for node in nodes]
+    assert [each.id for each in tracks[0]] == [each.id for each in tracks[1]] == ["0"]
+    assert at(tracks[0][0]) == at(tracks[1][0])
+    for content in (b"broken", path.read_bytes()):
+        path.write_bytes(content)
+        other = made(script, state_file=str(path), config="karle2023")
+        assert counts(other) == {}
+
+
+def test_the_state_of_the_tracker_is_published(script: ModuleType) -> None:
+    node = made(script)
+    tick(node, NOW_NS)
+    tick(node, NOW_NS + 5_000 * MS)
+    node.timers[1]()
+    [message] = node.published["/diagnostics"]
+    first = message.status[0]
+    assert (first.name, first.level) == ("fgtrack", b"\x03")
+    assert "no sensor that starts tracks sends anything" in first.message
+    assert [each.level for each in message.status[1:]] == [b"\x01"] * 3
+
+
+def test_the_package_starts_the_node_with_the_parameters_that_it_declares(
+    script: ModuleType,
+) -> None:
+    given = YAML(typ="safe").load((PACKAGE / "config/tracker.yaml").read_text("utf-8"))
+    assert given["fgtrack"]["ros__parameters"] == script.PARAMETERS
+    view = YAML(typ="safe").load((PACKAGE / "rviz/tracker.rviz").read_text("utf-8"))
+    shown = [each["Class"] for each in view["Visualization Manager"]["Displays"]]
+    assert "vision_msgs_rviz_plugins/Detection3DArray" in shown
+    setup = (PACKAGE / "setup.py").read_text("utf-8")
+    launch = (PACKAGE / "launch/tracker.launch.py").read_text("utf-8")
+    compile(launch, "launch", "exec")
+    for name in ("package.xml", "launch/tracker.launch.py", "config/tracker.yaml"):
+        assert (PACKAGE / name).is_file()
+        assert f'"{name}"' in setup
+    manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    needed = {each.text for each in manifest.iter("exec_depend")}
+    source = (PACKAGE / "fgtrack_ros/node.py").read_text("utf-8")
+    imported = {
+        line.split()[1].partition(".")[0]
+        for line in (*source.splitlines(), *launch.splitlines())
+        if line.startswith(("from ", "import ")) and "fgtrack" not in line
+    }
+    assert imported - set(sys.stdlib_module_names) == needed
