@@ -60,7 +60,7 @@ def test_what_is_imported_is_asked_for() -> None:
     asked = {_name(one.name) for one in REQUIRED}
     asked |= {
         _name(Requirement(line).name)
-        for extra in ("dask", "foxglove", "ais", "asterix")
+        for extra in ("dask", "foxglove", "ais", "asterix", "parquet")
         for line in EXTRAS[extra]
     }
     installed = packages_distributions()
