@@ -121,7 +121,10 @@ def _study_each(
 
 
 def _folders(recordings: Sequence[Path], out: Path) -> list[Path]:
-    """Return a folder in `out` for each recording: its name, with the ending if names are equal otherwise."""
+    """Return a folder in `out` for each recording: its name, with the ending if names are equal otherwise.
+
+    Raises `CallError` for equal names.
+    """
     stems = [
         path.name if path.is_dir() else path.name.split(".")[0] for path in recordings
     ]

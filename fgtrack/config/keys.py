@@ -95,7 +95,10 @@ def _fields(cls: Any) -> list["dataclasses.Field[Any]"]:  # Any: a dataclass
 
 
 def _dataclasses(hint: Any, named: str = "") -> Iterator[tuple[type, str | None, str]]:
-    """Yield the dataclasses in a type, each with its `kind` where it has one, and NAME in a mapping or list."""
+    """Yield the dataclasses in a type: each with its `kind` or None, and with its part of a key.
+
+    The part is NAME in a mapping, N in a list, else `named`.
+    """
     origin = get_origin(hint)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         yield hint, _kind(hint), named

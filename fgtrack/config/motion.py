@@ -149,7 +149,10 @@ class MotionConfig:
         return model.from_std_per_step(self.std_per_s, NOISE_HZ, **others)
 
     def _densities(self) -> dict[str, float]:
-        """Densities from `std_per_s` for the registered model of this kind; empty if `std_per_s` is not set."""
+        """Densities from `std_per_s` for the registered model of this kind; empty if `std_per_s` is not set.
+
+        Raises `ValueError` if the model is a function: `std_per_s` has no meaning then.
+        """
         if not self._has_stds:
             return {}
         model = MOTION_MODELS.load(self.kind)

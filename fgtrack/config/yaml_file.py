@@ -57,8 +57,10 @@ def with_settings(
 ) -> T:
     """Return `raw` as an instance of `kind` after setting values by dotted keys.
 
-    A key inside a section that `raw` does not contain changes a value of the section's
-    default: a sensor among all sensors, or a value of the same `kind`.
+    A key inside a section that `raw` does not contain changes a value of the section's default: a sensor among all
+    sensors, or a value of the same `kind`.
+
+    Raises `CallError` with the key.
     """
     if not settings:
         return validate(kind, raw, origin)
@@ -72,7 +74,10 @@ def with_settings(
 
 
 def read_yaml(path: Path) -> dict[str, Any]:  # Any: validated later
-    """Return the mapping in the YAML 1.2 file `path`; an empty file gives an empty mapping."""
+    """Return the mapping in the YAML 1.2 file `path`; an empty file gives an empty mapping.
+
+    Raises `CallError` if the file cannot be read, or contains no mapping.
+    """
     try:
         with open_text(path) as file:
             value = _parse(file.read(), str(path))

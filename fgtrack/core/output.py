@@ -152,7 +152,10 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def _part_of(path: Path) -> Iterator[Path]:
-    """Folder `<path>.*.part` that is removed at the end of the block; an interrupt or a kill leaves it."""
+    """Folder `<path>.*.part` that is removed at the end of the block; an interrupt or a kill leaves it.
+
+    Raises the exceptions of `write_error`.
+    """
     absolute = Path(os.path.abspath(path))
     part = absolute.with_name(f"{absolute.name}.{secrets.token_hex(6)}.part")
     try:

@@ -77,7 +77,10 @@ class LocalPlane:
     def position_m(
         self, latitude_deg: float, longitude_deg: float
     ) -> tuple[float, float]:
-        """East and north of a position in m; NaN for coordinates that do not exist on Earth."""
+        """Return east and north of a position in m. Without an origin, the position becomes the origin.
+
+        NaN for coordinates that do not exist on Earth, and for a position on the other side of the Earth.
+        """
         if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0):
             return math.nan, math.nan
         if self.origin is None:

@@ -94,12 +94,11 @@ def write_stream(
 ) -> int:
     """Write `messages`, which must be in receipt order, to `path` and return their number.
 
-    The file is gzipped if `path` ends in `.gz`. Equal messages give equal bytes. The
-    file gets its name when it is complete; a killed writer leaves a readable
-    `<path>.*.part`. `header` contains further entries of the header record.
+    The file is gzipped if `path` ends in `.gz`. Equal messages give equal bytes. The file gets its name when it is
+    complete; a killed writer leaves a readable `<path>.*.part`. `header` contains further entries of the header record.
 
-    Raises `TruncatedInput` if `messages` broke off, after the messages before the break
-    were written.
+    Raises `TruncatedInput` if `messages` broke off. The messages before the break are written to a new file, but an
+    existing file is not replaced.
     """
     path = Path(path)
     count = 0
@@ -159,7 +158,10 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
-    """Yield line number and JSON object of each line that is not blank; the first object is the header."""
+    """Yield line number and JSON object of each line that is not blank; the first object is the header.
+
+    Raises `TruncatedInput` or `DataError` after the records before the fault.
+    """
     line = 0
     num_records = 0
     try:
@@ -220,7 +222,10 @@ def _message(record: Record, unknown: Counter[str]) -> Message:
 
 
 def _in_plane(record: Record, plane: LocalPlane) -> Record:
-    """Return `record`, and each of its objects, with a position in `plane` instead of latitude and longitude."""
+    """Return `record`, and each of its objects, with a position in `plane` instead of latitude and longitude.
+
+    Raises `InvalidMessageError` if a latitude or longitude is not a number.
+    """
     objects = record.get("objects")
     if isinstance(objects, list) and any(
         isinstance(item, dict) and GEODETIC[0] in item for item in objects
@@ -251,6 +256,8 @@ def _from_json(
     """Return an instance of `kind` from the JSON object `record`.
 
     Null counts as missing. Unknown keys are ignored and counted in `unknown`.
+
+    Raises `InvalidMessageError` for a record that is not an object, or lacks a field.
     """
     if not isinstance(record, dict):
         raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")

@@ -219,7 +219,10 @@ def _items(value: Any) -> Sequence[Any]:
 
 
 def _covariance(value: Any) -> tuple[float, ...]:
-    """Return the numbers of a flat or square matrix, row by row; None becomes NaN."""
+    """Return the numbers of a flat or square matrix, row by row; None becomes NaN.
+
+    Raises `ValueError` for a matrix that is not square.
+    """
     if type(value) is tuple and all(
         type(each) is float for each in value
     ):  # the usual case

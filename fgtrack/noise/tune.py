@@ -280,7 +280,10 @@ class _Tuning:
             start = np.where(unbounded, self._configured, values)
 
     def _free(self, problem: Problem) -> BoolArray:
-        """Return the mask of parameters that are fitted: enough measurements, a maximum, and not kept."""
+        """Return the mask of parameters that are fitted: enough measurements, a maximum, and not kept.
+
+        Raises `DataError` if no standard deviation can be fitted.
+        """
         free = np.asarray(
             (problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._unbounded
         )
@@ -330,9 +333,11 @@ class _Tuning:
     ) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum with identifiable parameters only, the likelihood, and a report by parameter.
 
-        A parameter that is not identifiable keeps its configured value. If the data
-        reject this value, the parameter gets the nearest value that they do not reject.
-        The other parameters are not refitted, as they would compensate for it.
+        A parameter that is not identifiable keeps its configured value. If the data reject this value, the parameter
+        gets the nearest value that they do not reject. The other parameters are not refitted, as they would compensate
+        for it.
+
+        Raises `DataError` if no parameter is identifiable.
         """
         count = len(start)
         known: list[Known] = ["no"] * count

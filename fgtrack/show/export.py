@@ -63,6 +63,8 @@ def viewer_messages(
     """Return the messages that show `runs`, in order of log times, and a line for each content that cannot be shown.
 
     The keys of `runs` are their names.
+
+    Raises `CallError` for runs of different recordings.
     """
     (label, first), *others = runs.items()
     for name, run in others:

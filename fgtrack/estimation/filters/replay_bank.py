@@ -202,7 +202,10 @@ class ReplayBank(Stateful):
     def _update(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
-        """Return the results of a stack of measurements, one for each of `track_ids`."""
+        """Return the results of a stack of measurements, one for each of `track_ids`.
+
+        Raises `EstimatorError` with the tracks that failed.
+        """
         try:
             seen = one.seen_by(self._motion)
             is_plugin = not seen.model.is_compiled
@@ -276,7 +279,10 @@ class ReplayBank(Stateful):
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
     ) -> list[UpdateResult]:
-        """Fuse a stack of measurements in the compiled loop, and return the results."""
+        """Fuse a stack of measurements in the compiled loop, and return the results.
+
+        Raises `EstimatorError` with the tracks that failed.
+        """
         try:
             rows = np.array(list(map(self._rows.__getitem__, track_ids)))
             m, k = one.z.shape

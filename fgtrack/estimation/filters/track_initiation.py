@@ -188,10 +188,11 @@ class TrackInitiation:
         return nominal
 
     def _course(self) -> tuple[float, float]:
-        """Return the direction of the line, and the speed: a weighted mean of the speeds of the line and the
-        start.
+        """Return the direction of the line, and the speed: a weighted mean of the speeds of the line and the start.
 
         A short line may have a wrong speed.
+
+        Raises `numpy.linalg.LinAlgError` without a line.
         """
         if self.line is None:
             raise np.linalg.LinAlgError(

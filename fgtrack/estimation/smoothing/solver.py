@@ -97,7 +97,10 @@ class Solver(Stateful):
     def _solve(
         self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool
     ) -> None:
-        """Solve windows, see `solution_kernels.solve_windows`."""
+        """Solve windows, see `solution_kernels.solve_windows`.
+
+        Raises `numpy.linalg.LinAlgError` if a state is not finite.
+        """
         if not solution_kernels.solve_windows(
             tracks, starts, anchors, is_partial, self.nodes.arrays
         ):
@@ -120,10 +123,11 @@ class Solver(Stateful):
     def states_at(
         self, tracks: IntArray, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, at or after the oldest
-        node.
+        """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, at or after the oldest node.
 
         The states are interpolated, or predicted after the last node.
+
+        Raises `numpy.linalg.LinAlgError` if the process noise around a stamp is not positive definite.
         """
         nodes, indices = self.nodes, np.empty(len(tracks), dtype=np.int64)
         until_s, after_s = np.empty((2, len(tracks)))

@@ -93,6 +93,8 @@ def _read_present(
     """Add the numbers of all items in the field specification at byte `at` to `record`.
 
     Returns the first byte behind the items.
+
+    Raises `ValueError` for an item that the specification lacks.
     """
     first = at
     while block[at : at + 1] and block[at] & 1:

@@ -81,6 +81,8 @@ def _along_sight(
 
     `path` names the two components of the velocity, and `values` contain position or bearing. None if the velocity or
     the direction is missing.
+
+    Raises `FieldError` unless `path` names two fields.
     """
     paths = paths_of(path)
     if len(paths) != 2:
@@ -192,6 +194,8 @@ def items_by_fields(
     """Return the recorded objects of `message`, in the order of `objects_by_fields`.
 
     The path of the objects may lead through lists. Then the objects in all items of these lists are returned.
+
+    Raises `FieldError` if the path ends at no list.
     """
     if "objects" not in fields:
         return [message]

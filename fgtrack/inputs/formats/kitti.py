@@ -148,7 +148,10 @@ def _by_frame(
 
 
 def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bool:
-    """True if the detections of a file are bearings from the camera, False if they have positions."""
+    """True if the detections of a file are bearings from the camera, False if they have positions.
+
+    Raises `DataError` if a file has both.
+    """
     kinds = {
         item.x_m is None
         for items in frames.values()
@@ -178,8 +181,9 @@ def _folder_and_sequence(
 ) -> tuple[Path, str]:
     """Folder and name of a sequence.
 
-    `path` is the folder, or a file of `oxts/`; `named` is the number or name of the
-    sequence in a folder with several.
+    `path` is the folder, or a file of `oxts/`; `named` is the number or name of the sequence in a folder with several.
+
+    Raises `CallError` if the sequence must be named, or does not exist.
     """
     if path.is_file():
         return path.parent.parent, path.stem
@@ -257,7 +261,7 @@ def _region(
 def _detection(
     settings: KittiInput, sensor: str, view: View, fields: list[str]
 ) -> Detection | str:
-    """Detection of a line, or the setting that excludes it."""
+    """Detection of a line, or the setting that excludes it. Raises `ValueError` for a malformed line."""
     if len(fields) not in _FORMS:
         raise ValueError(
             f"it has {len(fields)} fields instead of 6 (a box in the image), 15 (AB3DMOT), 17 or 18 (KITTI)"

@@ -47,9 +47,9 @@ class Box(NamedTuple):
     def image_px(
         self, projection: FloatArray
     ) -> tuple[float, float, float, float] | None:
-        """Left, top, right and bottom of the box in the image of camera 2; None if the box is not visible.
+        """Return left, top, right and bottom of the box in the image of camera 2, limited to the image.
 
-        `projection` is the projection of camera 2, as in `View`.
+        None if no part of the box is visible. `projection` is the projection of camera 2, as in `View`.
         """
         signs = np.array(
             [[a, b, c] for a in (-0.5, 0.5) for b in (-1.0, 0.0) for c in (-0.5, 0.5)]
@@ -139,7 +139,7 @@ def lines_of(file: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
-    """Return `projection` and `rectified_from_imu` of `View`."""
+    """Return `projection` and `rectified_from_imu` of `View`. Raises the exceptions that malformed values cause."""
     matrices = {}
     for where, (name, *values) in lines_of(file):
         with reported_as(where):

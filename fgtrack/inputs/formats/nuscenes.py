@@ -103,7 +103,10 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
 
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
-    """Stamps of the scene's samples, by token, in the order of time."""
+    """Stamps of the scene's samples, by token, in the order of time.
+
+    Raises `CallError` unless exactly one scene is meant.
+    """
     names = {each["token"]: each["name"] for each in json_values(tables / "scene.json")}
     with_results = {token for token, _ in _results(file)}
     samples = [

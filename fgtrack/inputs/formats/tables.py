@@ -358,7 +358,10 @@ def headers(path: Path) -> dict[Path, list[str]]:
 
 
 def _file(path: Path, table: CsvTable, role: str) -> Path:
-    """Return the file of `table` after checking the mapped columns."""
+    """Return the file of `table` after checking the mapped columns.
+
+    Raises `CallError` if the columns do not suit the role.
+    """
     where = f"input.csv.{role}"
     columns = table.columns.keys()
     available = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())

@@ -51,8 +51,10 @@ def decompressed(file: Path) -> Iterator[Path]:
 def files_of(path: Path) -> list[Path]:
     """Return the files of the recording at `path`.
 
-    They are the file itself, the files in the folder's metadata.yaml, or all bag files
-    in the folder, if there is no metadata.yaml or a file in it has another name now.
+    They are the file itself, the files in the folder's metadata.yaml, or all bag files in the folder, if there is no
+    metadata.yaml or a file in it has another name now.
+
+    Raises `DataError` if two files have the same content.
     """
     files = [path]
     if (path / METADATA).is_file():

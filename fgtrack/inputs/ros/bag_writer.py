@@ -112,7 +112,10 @@ class BagTopics:
     def put(
         self, topic: str, message: RosMessage, log_ns: int, qos: Sequence[Qos] = ()
     ) -> None:
-        """Write `message`; `qos` contains the offered profiles if the topic is new."""
+        """Write `message`; `qos` contains the offered profiles if the topic is new.
+
+        Raises `DataError` for a log time out of the range of a bag.
+        """
         if not 0 <= log_ns < 1 << 63:
             raise DataError(
                 f"the log time {log_ns} ns is out of the range of a recording: correct the receipts"

@@ -118,7 +118,10 @@ def _covariance(message: RosMessage) -> tuple[float, ...] | None:
 
 
 def _from_transforms(topic: BagTopic, frames: BagFrames) -> ToEgo:
-    """Return the conversion of transforms: a state of the ego at each stamp of its nearest moving frame."""
+    """Return the conversion of transforms: a state of the ego at each stamp of its nearest moving frame.
+
+    Raises `CallError` if no frame of the ego moves. Heading comes from the transforms; the speed is NaN.
+    """
     moving = frames.moving_ego_frame
     ego_frame = frames.ego_frame
     map_frame = frames.map_frame

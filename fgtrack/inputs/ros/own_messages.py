@@ -50,7 +50,7 @@ class _Values:
         return form.unpack_from(self._data, begin)
 
     def text(self) -> str:
-        """Read a text, which ends in a zero byte."""
+        """Read a text, which ends in a zero byte. Raises `ValueError` for an incomplete text."""
         (length,) = self.take(_LENGTH, 4)
         text = self._data[self._at : self._at + length]
         self._at += length

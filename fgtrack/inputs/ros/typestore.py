@@ -237,7 +237,11 @@ def _user_types(path: Path) -> Typesdict:
 
 
 def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
-    """Return the types that the `definition` of the type `name` defines; empty if it has no text."""
+    """Return the types that the `definition` of the type `name` defines.
+
+    Empty without a text, and for another language than MSG and IDL. Raises `ValueError` for a text that is too long or
+    invalid.
+    """
     form, text = (
         (None, "") if definition is None else (definition.format, definition.data)
     )
@@ -314,7 +318,7 @@ def _check_type_name(name: str) -> None:
 
 
 def _innermost(description: FieldDesc) -> FieldDesc:
-    """Type of the elements of nested arrays and sequences."""
+    """Type of the elements of nested arrays and sequences. Raises `ValueError` for too long an array."""
     while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         description, size = cast("tuple[FieldDesc, int]", description[1])
         if not 0 <= int(size) <= _LONGEST_ARRAY:

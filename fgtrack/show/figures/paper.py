@@ -211,7 +211,10 @@ class Sheet:
         sharex: bool = False,
         sharey: bool = False,
     ) -> NDArray[Any]:  # Any: of Axes
-        """Return the axes of the plots, shape (rows, columns)."""
+        """Return the axes of the plots, shape (rows, columns).
+
+        Raises `CallError` for several plots in given axes that are not from `plt.subplots`.
+        """
         ratios: dict[str, Any] = {"height_ratios": heights, "width_ratios": widths}
         if self._ax is None:
             grid: Any = self.figure.add_gridspec(rows, columns, **ratios)

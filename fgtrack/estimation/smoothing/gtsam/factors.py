@@ -301,7 +301,10 @@ def _sensor(
 
 
 def _shipped(measurement: Measurement) -> MotionModel:
-    """Return the shipped motion model, with default parameters, of the state that is measured."""
+    """Return the shipped motion model, with default parameters, of the state that is measured.
+
+    Raises `CallError` if there is no such model.
+    """
     names = measurement.model.state_names
     for model in _SHIPPED:
         if model.state_names == names:

@@ -233,7 +233,10 @@ class IncrementalSolver(Solver):
             )
 
     def _changed_factors(self, track: int, start: int) -> _Changed:
-        """Return the factors of a track, from index `start` on, that have changed."""
+        """Return the factors of a track, from index `start` on, that have changed.
+
+        Raises `ValueError` if process noise is not positive definite.
+        """
         nodes, n = self.nodes, self.motion.dim
         most = nodes.count[track] - start
         owners = np.empty((most, 3), dtype=np.int64)
