@@ -51,7 +51,7 @@ class StepwiseReplay:
 
     motion: WhiteNoise
     arrays: tuple[Any, ...]
-    """Arrays of the bank, see `fgtrack.estimation.kernels.replay_arrays`; they are changed in place."""
+    """Arrays of the bank, see `fgtrack.estimation.kernels.replay_arrays`; `fused` changes them."""
     row: int
     """Row of the track in the arrays."""
     steps: dict[int, Outside]
