@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
 from fgtrack.ranking.crowd_result import CrowdResult
 from fgtrack.ranking.crowds import CROWDS, CrowdProblem
 from fgtrack.ranking.methods import Answers, Method, MethodError
@@ -32,8 +33,11 @@ def judge(
     A method that fails in a scenario has a result with the reason. `on_step` is called
     with the name of each step.
 
-    Raises `CallError` for an unknown scenario.
+    Raises `CallError` for an unknown scenario and for two methods with one name.
     """
+    for name, count in Counter(each.name for each in methods).items():
+        if count > 1:
+            raise CallError(f"{count} methods are called {name}: rename the files")
     results: list[Result | CrowdResult] = []
     for scenario in scenarios:
         seeds = range(seed, seed + num_runs)
@@ -111,7 +115,15 @@ def _judged(method: Method, scenario: str, problems: Sequence[Problem]) -> Resul
         refused,
         float(np.median([own.seconds / len(one.arrivals) for one, own in pairs])),
         peak_bytes,
+        sum(_is_indefinite(answer) for each in found for answer in each.answers),
     )
+
+
+def _is_indefinite(answer: Answer | None) -> bool:
+    """True for an answer whose covariance is not positive definite."""
+    if answer is None or answer.covariance is None:
+        return False
+    return float(np.linalg.eigvalsh(answer.covariance)[0]) <= 0.0
 
 
 def _peak_bytes(method: Method, problem: Problem) -> float:
@@ -156,8 +168,10 @@ def _deviations(problem: Problem, found: Answers) -> list[float]:
 
 
 def _nees(problem: Problem, found: Answers) -> float:
+    """Mean NEES of the present state; NaN without covariances, or if a covariance is not positive definite."""
+
     def one(answer: Answer, number: int) -> float:
-        if answer.covariance is None:
+        if answer.covariance is None or _is_indefinite(answer):
             return math.nan
         error = answer.mean - problem.truth[problem.queries[number].stamp_ns]
         return float(error @ np.linalg.solve(answer.covariance, error))

@@ -229,7 +229,6 @@ class Program(Method):
         """Answer all queries. Raises `MethodError` if the program fails or its file cannot be read."""
         count = len(problem.queries)
         found, seconds = self._called(
-            problem.scenario,
             lambda folder: write_problem(folder, problem),
             lambda states: tuple(read_states(states, count)),
         )
@@ -239,7 +238,6 @@ class Program(Method):
         """Answer all queries of a problem with several objects. Raises as `answers`."""
         count = len(problem.queries)
         found, seconds = self._called(
-            problem.scenario,
             lambda folder: write_crowd(folder, problem),
             lambda states: read_tracks(states, count),
         )
@@ -247,7 +245,6 @@ class Program(Method):
 
     def _called(
         self,
-        scenario: str,
         write: Callable[[Path], Path],
         read: Callable[[Path], T],
     ) -> tuple[T, float]:
@@ -265,16 +262,14 @@ class Program(Method):
                     check=False,
                 )
             except (OSError, subprocess.TimeoutExpired) as error:
-                raise MethodError(f"{self.name}: {one_line(str(error))}") from error
+                raise MethodError(one_line(str(error))) from error
             seconds = time.perf_counter() - started_s
             if done.returncode:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise MethodError(
-                    f"{self.name}: {scenario}: exit code {done.returncode}: {one_line(last)}"
-                )
+                raise MethodError(f"exit code {done.returncode}: {one_line(last)}")
             try:
                 return read(states), seconds
-            except (OSError, ValueError, KeyError, csv.Error) as error:
-                raise MethodError(
-                    f"{self.name}: {scenario}: states.csv: {one_line(str(error))}"
-                ) from error
+            except KeyError as error:
+                raise MethodError(f"states.csv: column {error} is missing") from error
+            except (OSError, ValueError, csv.Error) as error:
+                raise MethodError(f"states.csv: {one_line(str(error))}") from error

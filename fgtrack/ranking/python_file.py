@@ -1,7 +1,6 @@
 """Methods in Python: classes with `update` and `state_at`, and functions `fuse`."""
 
 import importlib.util
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -122,14 +121,14 @@ class PythonMethod(Method):
             raise
         except Exception as error:
             raise MethodError(
-                f"{self.name}: {problem.scenario}: {type(error).__name__}: {one_line(str(error))}"
+                f"{type(error).__name__}: {one_line(str(error))}"
             ) from error
         if len(raw) != len(problem.queries):
             raise MethodError(
-                f"{self.name}: {problem.scenario}: {len(problem.queries)} answers are expected, {len(raw)} came"
+                f"{len(problem.queries)} answers are expected, {len(raw)} came"
             )
         return Answers(
-            tuple(_checked(self.name, each) for each in raw),
+            tuple(_checked(each) for each in raw),
             time.process_time() - started_s,
             refused,
         )
@@ -149,7 +148,7 @@ class PythonMethod(Method):
             raise
         except Exception as error:
             raise MethodError(
-                f"{self.name}: {problem.scenario}: {type(error).__name__}: {one_line(str(error))}"
+                f"{type(error).__name__}: {one_line(str(error))}"
             ) from error
         return Tracks(tuple(found), time.process_time() - started_s)
 
@@ -179,7 +178,7 @@ class PythonMethod(Method):
             tracks = one.tracks_at((query.stamp_ns - problem.start_ns) / NS_PER_S)
             found.append(
                 {
-                    int(track_id): _position(self.name, state)
+                    int(track_id): _position(state)
                     for track_id, state in dict(tracks).items()
                 }
             )
@@ -245,11 +244,11 @@ def _is_method(name: str, code: object) -> bool:
     return name == "fuse" and callable(code)
 
 
-def _position(name: str, state: Any) -> FloatArray:
+def _position(state: Any) -> FloatArray:
     """Return the position of a track: its state begins with x and y."""
     position_m = np.asarray(state, dtype=np.float64)[:2]
     if position_m.shape != (2,) or not np.isfinite(position_m).all():
-        raise MethodError(f"{name}: a track must be finite x, y ..., not {state!r}")
+        raise MethodError(f"a track must be finite x, y ..., not {state!r}")
     return position_m
 
 
@@ -293,26 +292,35 @@ def _after_start_s(problem: Problem, stamp_ns: int) -> float:
     return (stamp_ns - problem.start.stamp_ns) / NS_PER_S
 
 
-def _checked(name: str, raw: Any) -> Answer | None:
+def _checked(raw: Any) -> Answer | None:
     """Return an answer: None, a mean, or a mean and a covariance. Raises `MethodError` for anything else."""
     if raw is None:
         return None
-    mean, covariance = raw if isinstance(raw, tuple) else (raw, None)
-    mean = np.asarray(mean, dtype=np.float64)
-    if mean.shape != (4,):
-        raise MethodError(
-            f"{name}: a mean must be x, y, vx, vy, shape (4,); its shape is {mean.shape}"
-        )
-    if covariance is None:
-        return Answer(mean, None)
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if covariance.shape != (4, 4):
-        raise MethodError(
-            f"{name}: a covariance must have shape (4, 4); its shape is {covariance.shape}"
-        )
-    if not math.isfinite(float(mean.sum() + covariance.sum())):
-        raise MethodError(f"{name}: an answer is not finite")
-    return Answer(mean, covariance)
+    mean, covariance = raw if _is_pair(raw) else (raw, None)
+    return Answer(
+        _finite("a mean must be x, y, vx, vy", mean, (4,)),
+        None
+        if covariance is None
+        else _finite("a covariance must be a matrix", covariance, (4, 4)),
+    )
+
+
+def _is_pair(raw: Any) -> bool:
+    """True for a mean with a covariance: two parts, the first with four numbers."""
+    return isinstance(raw, tuple | list) and len(raw) == 2
+
+
+def _finite(wanted: str, raw: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return `raw` as an array of finite numbers. Raises `MethodError` for anything else."""
+    try:
+        values = np.asarray(raw, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MethodError(f"{wanted}: {one_line(str(error))}") from error
+    if values.shape != shape:
+        raise MethodError(f"{wanted}, shape {shape}; its shape is {values.shape}")
+    if not np.isfinite(values).all():
+        raise MethodError("an answer is not finite")
+    return values
 
 
 def _module(path: Path) -> ModuleType:

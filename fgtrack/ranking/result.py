@@ -41,6 +41,8 @@ class Result:
     """Time for one measurement."""
     peak_bytes: float = math.nan
     """Largest memory of Python and NumPy during a run; NaN for a program."""
+    num_indefinite: int = 0
+    """Number of answers whose covariance is not positive definite."""
     problem: str | None = None
     """Reason why the method has no answers; None if it has."""
     takes_part: bool = True
@@ -102,6 +104,10 @@ class Result:
         elif anees.is_known and anees.high < _NUM_STATES:
             parts.append(
                 f"its covariance is too large: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
+            )
+        if self.num_indefinite:
+            parts.append(
+                f"covariances that are not positive definite: {self.num_indefinite}"
             )
         if self.refused:
             parts.append(

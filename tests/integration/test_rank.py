@@ -1,6 +1,7 @@
 """`fgtrack rank`: exact methods are named exact, other methods depart, and methods of others are taken in each form."""
 
 import json
+import math
 import os
 import re
 import sys
@@ -15,7 +16,7 @@ from fgtrack.cli.main import app
 from fgtrack.core.errors import CallError
 from fgtrack.ranking.files import read_states, write_exact, write_problem
 from fgtrack.ranking.judge import permuted
-from fgtrack.ranking.methods import Answers, MethodError
+from fgtrack.ranking.methods import Answers
 from fgtrack.ranking.problem import LAGS_S, Problem
 from fgtrack.ranking.public import MethodLike, method
 from fgtrack.ranking.public import rank as ranked
@@ -267,6 +268,10 @@ def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
         ("#!/bin/sh\necho no model >&2\nexit 3\n", "exit code 3: no model"),
         ("#!/bin/sh\n", "states.csv"),
         (
+            "#!/bin/sh\nawk 'BEGIN { print \"x\"; while (i++ < 15) print 1 }' > $2\n",
+            "states.csv: column 'x_m' is missing",
+        ),
+        (
             "#!/bin/sh\necho x_m > $2\n",
             "15 rows are expected, one for each query, not 0",
         ),
@@ -290,10 +295,59 @@ def test_a_file_without_a_method_is_refused(tmp_path: Path) -> None:
         method("ekf-repaly")
 
 
-def test_a_wrong_answer_is_named(tmp_path: Path) -> None:
-    one = method(written(tmp_path / "short.py", SHORT))
-    with pytest.raises(MethodError, match=r"shape \(4,\)"):
-        one.answers(draw("linear", 1))
+@pytest.mark.parametrize(
+    ("answer", "fault"),
+    [
+        ([1.0], "a mean must be x, y, vx, vy, shape (4,); its shape is (1,)"),
+        ((1.0, 2.0, 3.0, math.nan), "an answer is not finite"),
+        ((np.zeros(4), np.eye(3)), "matrix, shape (4, 4); its shape is (3, 3)"),
+        ("here", "could not convert string to float"),
+        ({"x": 1.0}, "a mean must be x, y, vx, vy"),
+    ],
+)
+def test_a_wrong_answer_is_named(answer: Any, fault: str) -> None:
+    class Wrong:
+        def __init__(self, given: Any) -> None: ...
+
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> Any:
+            return answer
+
+    result = rank(Wrong)
+    assert result.problem is not None
+    assert fault in result.problem
+
+
+def test_a_covariance_that_is_not_positive_definite_is_named() -> None:
+    class Negative:
+        def __init__(self, given: Any) -> None: ...
+
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> Any:
+            return np.zeros(4), np.diag([1.0, 1.0, 1.0, -1.0])
+
+    result = rank(Negative)
+    assert np.isnan(result.nees).all()
+    assert "covariances that are not positive definite: 33" in result.sentence
+
+
+def test_a_pair_may_be_a_list_and_a_mean_a_tuple() -> None:
+    class Constant:
+        def __init__(self, given: Any) -> None: ...
+
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> Any:
+            return [(1.0, 2.0, 3.0, 4.0), np.eye(4).tolist()]
+
+    assert rank(Constant).problem is None
+
+
+def test_two_methods_with_one_name_are_refused() -> None:
+    with pytest.raises(CallError, match="2 methods are called drop"):
+        ranked(["drop", "drop"], ["linear"])
 
 
 def test_truth_and_exact_estimate_agree_with_the_exact_covariance() -> None:

@@ -39,13 +39,14 @@ def test_accumulated_densities_of_stone_soup_depart_with_the_lag() -> None:
         assert measured / 5 < deviation < measured * 5
     assert sorted(deviations) == deviations
     assert all(each.order > 0.1 for each in found)
+    assert "covariances that are not positive definite" in found[1].sentence
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of Stone Soup
 def test_accumulated_densities_of_stone_soup_diverge_where_much_is_late() -> None:
     pytest.importorskip("stonesoup", reason="stonesoup is not installed")
     (result,) = rank([f"{STONE_SOUP}:Accumulated"], ["linear"], num_runs=2).results
-    assert result.problem == "stone_soup.Accumulated: an answer is not finite"
+    assert result.problem == "an answer is not finite"
 
 
 def test_examples_of_stone_soup_for_late_data_are_named() -> None:
