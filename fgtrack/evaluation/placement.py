@@ -78,6 +78,16 @@ def update_rows(run: Run) -> IntArray:
     """Return the row of `Run.updates` for each row of `Run.detections`, shape (n,); -1 for a detection without an
     update.
     """
+    updates = run.tables["updates"]
+    detections = run.tables["detections"]
+    n = updates.num_rows
+    # The writer has one order for both; detections that were never processed follow.
+    if n <= detections.num_rows and all(
+        np.array_equal(updates[name], detections[name][:n]) for name in _KEY
+    ):
+        return np.where(
+            np.arange(detections.num_rows) < n, np.arange(detections.num_rows), -1
+        )
     import pandas as pd
 
     frames = run.updates[_KEY], run.detections[_KEY]

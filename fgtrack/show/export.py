@@ -79,7 +79,7 @@ def viewer_messages(
     parts = [
         map_messages(maps, at_ns),
         ego_messages(first.tables["ego"], at_ns),
-        *truth_messages(first.tables["truth"]),
+        truth_messages(first.tables["truth"]),
     ]
     for layer, run in zip(_layers(runs), runs.values(), strict=True):
         parts += run_messages(run, layer)

@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
-from operator import itemgetter
+from dataclasses import dataclass, field
+from functools import lru_cache
+from heapq import merge
+from itertools import chain, groupby, pairwise
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -51,6 +53,8 @@ _MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
 _DEVIATIONS = 2.0  # half axes of an ellipse, in standard deviations
 _SHOWN_S = 0.5  # display time of a list, unless a later list of its sensor replaces it
 _DOT_M, _BEARING_M = 1.0, 150.0
+# Number of times whose messages are made together.
+_BLOCK_TIMES = 256
 _USED = (*FUSED, Disposition.MERGED)
 
 
@@ -67,6 +71,7 @@ class RunLayer:
         return rgba(self.colour or PALETTE[track_id % len(PALETTE)], opacity)
 
 
+@lru_cache(maxsize=256)
 def rgba(text: str, opacity: float = 1.0) -> Colour:
     """Return the colour #RRGGBB as numbers from 0 to 1."""
     r, g, b = (round(value / 255.0, 3) for value in bytes.fromhex(text[1:]))
@@ -111,9 +116,16 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
         )
 
 
-def truth_messages(truth: Columns) -> Iterator[Messages]:
-    """Yield two streams: boxes and poses of the true objects at every stamp, without the ego."""
+def truth_messages(truth: Columns) -> Messages:
+    """Yield boxes and poses of the true objects at every stamp, without the ego."""
     table = with_position(truth.where(truth["object_id"] != EGO_ID))
+    before: set[str] = set()
+    for rows in _blocks(table["stamp_ns"], np.unique(table["stamp_ns"])):
+        yield from _merged(_truth_messages(table.where(rows), before))
+
+
+def _truth_messages(table: Columns, before: set[str]) -> Iterator[Messages]:
+    """Yield the two streams of the rows of `table`; `before` as in `_scenes`."""
     states = [
         Detection(x_m, y_m, _known(yaw_rad), object_id=object_id)
         for object_id, x_m, y_m, yaw_rad in _rows(
@@ -127,13 +139,13 @@ def truth_messages(truth: Columns) -> Iterator[Messages]:
             (_box(*_pose(states[row]), (*_WHITE[:3], 0.35)),),
         )
 
-    yield _scenes("/truth", groups(table["stamp_ns"]), box)
+    yield _scenes("/truth", groups(table["stamp_ns"]), box, before)
     yield _objects("/truth", table["stamp_ns"], table["stamp_ns"], states)
 
 
 def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     """Yield the streams of messages that show a single run, each in order of log times."""
-    yield from _track_messages(run, layer)
+    yield _tick_messages(run, layer)
     yield _past_messages(run, layer)
     # A state is shown when it has become final.
     final = with_position(
@@ -147,7 +159,44 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     yield _outcome_messages(run, layer)
 
 
-def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
+def _tick_messages(run: Run, layer: RunLayer) -> Messages:
+    """Yield the messages of all ticks, of which some hundred are in memory at a time."""
+    tracks = run.tables["tracks"]
+    timing = run.tables["timing"]
+    times_ns = np.union1d(timing["now_ns"], tracks["now_ns"])
+    before = _Before()
+    blocks = zip(
+        _blocks(tracks["now_ns"], times_ns),
+        _blocks(timing["now_ns"], times_ns),
+        strict=True,
+    )
+    for rows, ticks in blocks:
+        piece = run.with_tables(tracks=tracks.where(rows), timing=timing.where(ticks))
+        yield from _merged(_track_messages(piece, layer, before))
+
+
+@dataclass
+class _Before:
+    """Names of the entities in the last scenes."""
+
+    boxes: set[str] = field(default_factory=set)
+    patches: set[str] = field(default_factory=set)
+
+
+def _blocks(values_ns: IntArray, times_ns: IntArray) -> Iterator[IntArray]:
+    """Yield, for each `_BLOCK_TIMES` of the ascending `times_ns`, the rows whose value is among them."""
+    order = np.argsort(values_ns, kind="stable")
+    edges = np.searchsorted(values_ns[order], times_ns[::_BLOCK_TIMES])
+    for first, end in pairwise([*edges.tolist(), len(order)]):
+        yield order[first:end]
+
+
+def _merged(streams: Iterator[Messages]) -> Messages:
+    """Return the messages of `streams` in order of log times."""
+    return merge(*streams, key=attrgetter("log_ns"))
+
+
+def _track_messages(run: Run, layer: RunLayer, before: _Before) -> Iterator[Messages]:
     """Yield three streams of messages over all ticks: boxes with names and speeds, 2-sigma ellipses of the positions,
     and poses.
     """
@@ -210,8 +259,8 @@ def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
         )
         return Entity(f"track {track_id}", (shape,)) if math.isfinite(long_m) else None
 
-    yield _scenes(f"{layer.prefix}/tracks", ticks, box)
-    yield _scenes(f"{layer.prefix}/ellipses", ticks, patch)
+    yield _scenes(f"{layer.prefix}/tracks", ticks, box, before.boxes)
+    yield _scenes(f"{layer.prefix}/ellipses", ticks, patch, before.patches)
     yield _objects(
         f"{layer.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states
     )
@@ -341,7 +390,12 @@ def _outcome_messages(run: Run, layer: RunLayer) -> Messages:
         "track_id",
         "nis",
     )
-    rows = sorted(_rows(run.tables["updates"], *names), key=itemgetter(0))
+    updates = run.tables["updates"]
+    receipts_ns = np.unique(updates["receipt_ns"])
+    rows = chain.from_iterable(
+        _rows(updates.where(block), *names)
+        for block in _blocks(updates["receipt_ns"], receipts_ns)
+    )
     for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in rows:
         values = {
             "sensor": sensor,
@@ -360,12 +414,14 @@ def _scenes(
     topic: str,
     rows_at: Iterable[tuple[int, IntArray]],
     entity: Callable[[int], Entity | None],
+    before: set[str] | None = None,
 ) -> Messages:
     """Yield a scene for each time, with the entities of its rows.
 
-    An entity of the scene before that is missing in this scene is removed.
+    An entity of the scene before that is missing in this scene is removed. `before`
+    are the names in the scene before the first, and afterwards in the last.
     """
-    before: set[str] = set()
+    before = set() if before is None else before
     for at_ns, rows in rows_at:
         entities = tuple(
             item for row in rows.tolist() if (item := entity(row)) is not None
@@ -375,7 +431,8 @@ def _scenes(
             yield ViewerMessage(
                 at_ns, at_ns, topic, Scene(entities, tuple(sorted(before - names)))
             )
-        before = names
+        before.clear()
+        before.update(names)
 
 
 def _objects(
@@ -392,12 +449,12 @@ def _objects(
 def _states(states: Columns, objects: Columns) -> list[Detection]:
     """Return the pose of each row with its covariance, and the class and size of its track if known."""
     described = {
-        track_id: Detection(
-            length_m=_known(length_m),
-            width_m=_known(width_m),
-            height_m=_known(height_m),
-            class_name=name,
-        )
+        track_id: {
+            "length_m": _known(length_m),
+            "width_m": _known(width_m),
+            "height_m": _known(height_m),
+            "class_name": name,
+        }
         for track_id, length_m, width_m, height_m, name in _rows(
             objects, "track_id", "length_m", "width_m", "height_m", "class_name"
         )
@@ -418,14 +475,16 @@ def _states(states: Columns, objects: Columns) -> list[Detection]:
         states, "x_m", "y_m", "yaw_rad", "track_id", *names
     ):
         P = tuple(covariance) if math.isfinite(yaw_rad + sum(covariance)) else None
-        pose = {
-            "x_m": x_m,
-            "y_m": y_m,
-            "yaw_rad": _known(yaw_rad),
-            "covariance": P,
-            "object_id": track_id,
-        }
-        result.append(replace(described.get(track_id, Detection()), **pose))
+        result.append(
+            Detection(
+                x_m,
+                y_m,
+                _known(yaw_rad),
+                covariance=P,
+                object_id=track_id,
+                **described.get(track_id, {}),
+            )
+        )
     return result
 
 

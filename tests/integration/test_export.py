@@ -204,6 +204,16 @@ ROW = ("now_ns", "x_m", "y_m")
 STAMP_NS, RECEIPT_NS, TICK_NS = 1_000_000_000, 1_400_000_000, 1_410_000_000
 
 
+def test_blocks_of_times_do_not_change_a_message(
+    runs: Path,
+    shown: dict[str, list[ViewerMessage]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also a track that ends where a block ends is removed from the scene."""
+    monkeypatch.setattr("fgtrack.show.run_messages._BLOCK_TIMES", 3)
+    assert messages_of(runs / "smoother") == shown
+
+
 @pytest.fixture(scope="module")
 def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An ego at (100, 50) that looks north; an object is sensed 10 m ahead and received when it is 8 m farther."""
