@@ -303,3 +303,14 @@ def test_a_consistency_alone_names_no_best_estimator(tmp_path: Path) -> None:
     table = difference_table(seed_comparisons(sweep), sweep.axes)
     assert table.records
     assert not any(map(table.is_main, table.records))
+
+
+def test_states_without_a_lag_are_no_waited_output(tmp_path: Path) -> None:
+    lags = ("0.0", "0.3", "window")
+    names = [f"lagged.{lag}.errors.position_m.rmse" for lag in lags]
+    rows = [["delay_s", "seed", "estimator", POSITION, *names]]
+    rows += [[delay, "0", "smoother", "0.3", "0.3", "0.2", "0.1"] for delay in DELAYS]
+    (tmp_path / SWEEP_FILE).write_text("\n".join(map(",".join, rows)) + "\n")
+    [axes] = plot.error_against_delay(tmp_path).axes
+    labels = [str(line.get_label()) for line in axes.lines]
+    assert labels == ["smoother", "smoother, 0.3 s later"]

@@ -243,7 +243,7 @@ def error_against_delay(
         with as_file(files(__package__) / "error_against_delay") as folder:
             table = read_sweep(folder)
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
+    waits = [name for name in table.metrics if _is_waited(name)][:1]
     curves = {metric: _means(table, metric) for metric in (_POSITION, *waits)}
     (delay, *others), points = table.shown_axes or [""], curves[_POSITION]
     if others or points.empty or not _are_numbers(points[delay]):
@@ -305,6 +305,12 @@ def error_against_delay(
         f"{_SHARES_NOTE if has_shares else ''})"
     )
     return sheet.figure
+
+
+def _is_waited(metric: str) -> bool:
+    """True for the position error of states with a positive lag; the lag of a final state differs."""
+    lag = metric.removeprefix("lagged.").partition(".errors.")[0]
+    return fnmatchcase(metric, _LAGGED) and lag != "window" and float(lag) > 0.0
 
 
 def has_delays(table: SweepTable) -> bool:
