@@ -13,7 +13,7 @@ from math import isfinite
 from numbers import Real
 from operator import index, is_
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -200,11 +200,14 @@ def _frame(value: Any) -> str:
     return text
 
 
+def _is_plain(value: Any) -> TypeGuard[tuple[float, ...]]:
+    """True for a tuple of floats, the usual case."""
+    return type(value) is tuple and all(type(each) is float for each in value)
+
+
 def _numbers(value: Any) -> tuple[float, ...]:
     """Return the numbers of a sequence as a tuple of floats."""
-    if type(value) is tuple and all(
-        type(each) is float for each in value
-    ):  # the usual case
+    if _is_plain(value):
         return value
     return tuple(map(_number, _items(value)))
 
@@ -223,9 +226,7 @@ def _covariance(value: Any) -> tuple[float, ...]:
 
     Raises `ValueError` for a matrix that is not square.
     """
-    if type(value) is tuple and all(
-        type(each) is float for each in value
-    ):  # the usual case
+    if _is_plain(value):
         return value
     entries = _items(value)
     if entries and not any(each is None or isinstance(each, Real) for each in entries):
