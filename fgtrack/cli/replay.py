@@ -114,7 +114,10 @@ def replay(
     if (broken := runs[0].meta["broken_off"]) is not None:
         problem = pipeline.with_origin(broken, str(recording))
         raise DataError(f"{problem}; the messages before are replayed")
-    reason = received_nothing(runs[0]) or unused(runs[0])
+    reason = received_nothing(runs[0])
+    if reason is not None and draft.open_sensors:
+        reason = draft.problem  # the sensors are left out
+    reason = reason or unused(runs[0])
     if reason is None and loop is not None:
         reason = loop.text
     if (reason := reason or draft.problem) is not None:

@@ -161,7 +161,10 @@ def _problem(found: Study, recording: Path) -> str | None:
         return f"{problem}; the messages before are used"
     run = found.runs[0]
     loop = repeated(run)
-    reason = received_nothing(run) or unused(run)
+    reason = received_nothing(run)
+    if reason is not None and found.problem is not None:
+        reason = found.problem  # the sensors are left out
+    reason = reason or unused(run)
     if reason is None and loop is not None:
         reason = loop.text
     reason = reason or found.problem

@@ -57,6 +57,8 @@ _HULLS = 2.0 * math.sqrt(12.0)
 """Length of a long hull, divided by the standard deviation on each axis of the difference of two of its detections."""
 _FIRST_MESSAGES = 20_000
 """Number of messages by which components without information are recognised."""
+#: Longest delay that is assumed to be real.
+_LONGEST_DELAY_S = 30.0
 _LONGEST_S = 60.0
 """Longest window."""
 #: Standard deviation per step at 100 Hz, which is a density of 225 m^2/s^3. The density of Singer's model (Estimating
@@ -245,7 +247,8 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
     if needed_s <= limit_s and turn_mps2 <= _LARGEST_TURN_MPS2:
         return
     shortest_s = min(item.revisit_s or 0.0 for item in used)
-    window_s = min(float(math.ceil(2.0 * shortest_s)), _LONGEST_S)
+    two_lists_s = float(math.ceil(2.0 * shortest_s))
+    window_s = min(max(two_lists_s, _late_s(used)), _LONGEST_S)
     reason = (
         f"an object is measured every {shortest_s:.2g} s, so its heading must be predicted for {needed_s:.2g} s; "
         f"the default model does so for {limit_s:.2g} s only"
@@ -495,28 +498,36 @@ def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield windows that hold two lists of the slowest sensor in use."""
-    rates_hz = [
-        item.object_hz
-        for name, item in covered.items()
-        if item.object_hz and name not in config.ignore_sensors
-    ]
-    needed_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
-    lag_s = min(needed_s, _LONGEST_S - config.smoother.ring_s)
+    """Yield windows that hold two lists of the slowest sensor in use, and the delays of nearly all lists."""
+    used = [item for name, item in covered.items() if name not in config.ignore_sensors]
+    rates_hz = [item.object_hz for item in used if item.object_hz]
+    two_lists_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
+    late_s = _late_s(used)
+    ring_s = config.smoother.ring_s
+    needed_s = max(two_lists_s, late_s - ring_s)
+    lag_s = min(needed_s, _LONGEST_S - ring_s)
     if (
         lag_s > config.smoother.lag_s
         and config.smoother == SmootherSettings()
         and config.filter == FilterConfig()
     ):
+        words = f"detections that come up to {late_s:g} s late"
+        words = words if needed_s > two_lists_s else _TWO_LISTS
         reason = (
-            _TWO_LISTS
+            words
             if lag_s == needed_s
-            else f"{_TWO_LISTS} take {needed_s:g} s, longer than the longest window"
+            else f"{words} take {needed_s:g} s, longer than the longest window"
         )
         yield Assumption(("smoother", "lag_s"), lag_s, reason)
-        yield Assumption(
-            ("filter", "storage_s"), lag_s + config.smoother.ring_s, reason
-        )
+        yield Assumption(("filter", "storage_s"), lag_s + ring_s, reason)
+
+
+def _late_s(used: Iterable[Coverage]) -> float:
+    """Delay that a window must hold, in whole seconds; longer delays than `_LONGEST_DELAY_S` are clock errors."""
+    delays_s = (math.ceil(1.2 * item.delay_s) for item in used)
+    return float(
+        max((each for each in delays_s if each <= _LONGEST_DELAY_S), default=0)
+    )
 
 
 def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:

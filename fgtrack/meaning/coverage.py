@@ -75,6 +75,7 @@ _MOST_REVISITS = 5000
 _FEWEST_REVISITS = 20
 #: Silence of a sensor after which objects count as new.
 _OUTAGE_S = 2.0
+_DELAY_QUANTILE = 0.98
 #: Columns of `_Detections.rows`.
 _NUM_COLUMNS = 7
 
@@ -95,6 +96,8 @@ class Coverage:
     """Lists per second; None for fewer than two lists."""
     silence_s: float = 0.0
     """Longest time between two successive lists, up to `_OUTAGE_S`; after longer times objects count as new."""
+    delay_s: float = 0.0
+    """Time from stamp to receipt that 98 % of the lists stay below."""
     scans: bool = True
     """False if the sensor reports objects one by one, as ADS-B, AIS and V2X do.
 
@@ -257,6 +260,7 @@ class _Detections:
             boxes=self.boxes,
             rate_hz=(num_lists - 1) / span_s if span_s > 0.0 else None,
             silence_s=float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0)),
+            delay_s=float(np.quantile(receipts_s - stamps_s, _DELAY_QUANTILE)),
             scans=not has_enough_lists
             or not counts.all()
             or bool(singles < _REPORTS_SHARE * num_lists),

@@ -482,3 +482,22 @@ def test_without_a_configuration_a_recording_is_tracked_as_with_what_it_carries(
         != replay(messages).meta["digest"]
     )
     assert bare.config["ego"]["detection_origin_x_m"] == -1.74
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "window_s"), [(0.1, 3.0), (2.5, 3.0), (6.0, 8.0), (45.0, 3.0)]
+)
+def test_windows_hold_the_delays_of_nearly_all_lists(
+    delay_s: float, window_s: float
+) -> None:
+    delay_ns = round(1e9 * delay_s)
+
+    def late():
+        for one in forward():
+            yield replace(one, receipt_ns=one.stamp_ns + delay_ns)
+
+    config = assumed(Config(), source_of(late)).config
+    assert config.filter.storage_s == pytest.approx(window_s, abs=1.0)
+    assert config.smoother.lag_s + config.smoother.ring_s == pytest.approx(
+        window_s, abs=1.0
+    )
