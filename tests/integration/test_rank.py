@@ -105,19 +105,17 @@ def test_late_data_that_count_as_present_are_named() -> None:
     assert "another order of arrival changes an estimate" in result.sentence
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        "range-bearing",
-        pytest.param("doppler", marks=pytest.mark.slow),
-        pytest.param("ctrv", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["range-bearing", "doppler", "ctrv"])
 def test_nonlinear_scenarios_rank_an_iterated_smoother_near_the_exact_estimate(
     scenario: str,
 ) -> None:
-    result = rank("smoother-batch", scenario)
-    assert np.nanmax(result.deviations) < 0.2
+    assert np.nanmax(rank("smoother-batch", scenario).deviations) < 0.2
+
+
+def test_a_filter_is_near_the_exact_estimate_of_a_nonlinear_scenario() -> None:
+    result = rank("ekf-replay", "range-bearing")
+    assert EXACT < result.deviation < 0.2
 
 
 def test_the_adapter_of_the_page_runs_and_departs(tmp_path: Path) -> None:

@@ -56,6 +56,7 @@ def test_examples_of_stone_soup_for_late_data_are_named() -> None:
         assert "another order of arrival changes an estimate by" in result.sentence
 
 
+@pytest.mark.slow
 def test_stone_soup_sorts_range_and_bearing() -> None:
     (result,) = results("stonesoup", "Sorted", ("range-bearing",))
     assert result.deviation < 1.0
