@@ -24,4 +24,4 @@ def test_intervals_of_mounts_contain_the_true_mounts() -> None:
             ratios += (np.array(item.half_widths) / (1.96 * stds)).tolist()
     assert len(covered) == 36
     assert np.mean(covered) > 0.85
-    assert 1.0 < np.median(ratios) < 2.5
+    assert 1.0 < np.median(ratios) < 1.8

@@ -34,7 +34,8 @@ _HULL_M = 1.0
 _FEWEST_OBJECTS_DOF = 1.5
 #: Degrees of freedom of this standard deviation, which is known from experience.
 _HULL_DOF = 20.0
-#: Largest chance at which a jackknife over other clusters counts as larger.
+#: Degrees of freedom of the model of the noise, and largest chance at which a jackknife counts as larger.
+_MODEL_DOF = 6.0
 _LARGER = 0.05
 #: Speed of an object that may stand still, and its shortest observation.
 STILL_MPS = 0.5
@@ -147,10 +148,39 @@ def _spread(
         larger = known & (chance < _LARGER)
         std = np.where(larger, other, std)
         dof = np.where(larger, other_dof, dof)
+    std, dof = _moderated(data, functions, std, dof)
     few = other_dof < _FEWEST_OBJECTS_DOF
     share = np.square(hulls) / (1.0 + np.maximum(other_dof, 0.0))
     dof = np.where(few, dof_of_sum(np.square(std), dof, share, _HULL_DOF), dof)
     return np.where(few, np.sqrt(np.square(std) + share), std), dof
+
+
+def _moderated(
+    data: Information, functions: FloatArray, std: FloatArray, dof: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return standard deviations and degrees of freedom, moderated by those of the model of the noise.
+
+    The jackknife is unbiased but has few degrees of freedom. Its variance and the
+    variance of the model are averaged with their degrees of freedom as weights (Smyth,
+    Statistical Applications in Genetics and Molecular Biology 3, 2004), unless the
+    jackknife is significantly larger: then the model is wrong.
+    """
+    from scipy.special import fdtrc
+
+    if not data.g.shape[1]:
+        return std, dof
+    total = data.H.sum(axis=0) + np.diag(data.prior)
+    model = np.einsum("ij,ji->i", functions, psd_solve(total, functions.T))
+    known = (dof >= FEWEST_DOF) & np.isfinite(std) & (model > 0.0)
+    square = np.square(np.where(known, std, 1.0))
+    model = np.where(known, model, 1.0)
+    chance = fdtrc(np.maximum(dof, 1e-3), _MODEL_DOF, square / model)
+    agrees = known & (chance >= _LARGER)
+    mean = (_MODEL_DOF * model + dof * square) / (_MODEL_DOF + dof)
+    return (
+        np.where(agrees, np.sqrt(mean), std),
+        np.where(agrees, _MODEL_DOF + dof, dof),
+    )
 
 
 def sight_errors(table: Table, poses: Sequence[Pose2], root: Pose2) -> tuple[int, ...]:
