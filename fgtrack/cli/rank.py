@@ -48,7 +48,7 @@ def rank(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Rank methods for late measurements of one object or of several objects.
+    """Rank methods for late measurements of one or several objects.
 
     Each method answers the same questions: where is the object now, and where was it?
     The answers are compared with the truth and with the exact joint estimate, the tracks
