@@ -3,7 +3,7 @@
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ _COLUMNS = (
 
 
 def write_problem(folder: Path, problem: Problem) -> Path:
-    """Write `measurements.csv` and `problem.json` into `folder`; return the path of the table.
+    """Write `measurements.csv`, `prior.csv` and `problem.json` into `folder`; return the path of the measurements.
 
     Rows are in the order of receipt. A row of the kind `query` asks for the state at
     its stamp, from the rows above. Times are in s after the start of the problem.
@@ -52,6 +52,7 @@ def write_problem(folder: Path, problem: Problem) -> Path:
         writer = csv.DictWriter(file, _COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
+    write_states(folder / "prior.csv", [problem.prior])
     (folder / "problem.json").write_text(
         json.dumps(described(problem), indent=2), encoding="utf-8"
     )
@@ -144,10 +145,15 @@ def write_exact(folder: Path, problem: Problem) -> None:
         writer.writerow(STATE)
         for query in problem.queries:
             writer.writerow(problem.truth[query.stamp_ns].tolist())
-    with (folder / "exact.csv").open("w", newline="", encoding="utf-8") as file:
+    write_states(folder / "exact.csv", problem.exact)
+
+
+def write_states(path: Path, answers: Iterable[Answer]) -> None:
+    """Write answers with covariances in the columns of `states.csv`."""
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow((*STATE, *UPPER))
-        for answer in problem.exact:
+        for answer in answers:
             assert answer.covariance is not None
             upper = answer.covariance[np.triu_indices(4)]
             writer.writerow((*answer.mean.tolist(), *upper.tolist()))

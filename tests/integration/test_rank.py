@@ -383,6 +383,9 @@ def test_exported_files_hold_the_exact_states(tmp_path: Path) -> None:
         assert exact.covariance is not None
         np.testing.assert_array_equal(answer.mean, exact.mean)
         np.testing.assert_allclose(answer.covariance, exact.covariance, atol=1e-15)
+    (prior,) = read_states(tmp_path / "prior.csv", 1)
+    assert prior is not None
+    np.testing.assert_array_equal(prior.mean, problem.prior.mean)
     lines = path.read_text().splitlines()
     assert sum(line.startswith("query") for line in lines) == len(problem.queries)
     assert json.loads((tmp_path / "problem.json").read_text())["motion"] == "cv"
