@@ -18,7 +18,7 @@ from fgtrack.evaluation.placement import (
     update_rows,
 )
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
-from fgtrack.runs import Columns, Run
+from fgtrack.runs import Columns
 from fgtrack.show.palette import SENSORS, distinct_colours
 from fgtrack.show.states import (
     AROUND_95,
@@ -192,14 +192,16 @@ class _Recording:
                 "known": _column(self.seconds(final_ns(one.run, final)), _TIME_DIGITS),
                 **self.columns(final, "stamp_ns"),
             },
-            **self.detections(one.run),
+            **self.detections(one, notes, most),
         }
 
-    def detections(self, run: Run) -> Json:
+    def detections(self, one: EvaluatedRun, notes: dict[str, None], most: int) -> Json:
         """Return detections in order of receipt: stamp, sensor, fate, position, position of the track.
 
-        The fate is 0 for unused, 1 for used and 2 for late detections.
+        The fate is 0 for unused, 1 for used and 2 for late detections. More than `most`
+        rows are thinned to the lists of every k-th receipt.
         """
+        run = one.run
         table = run.tables["detections"]
         updates = run.tables["updates"]
         where = detections_in_map(run)
@@ -210,6 +212,14 @@ class _Recording:
         fate = np.isin(outcome, USED).astype(np.int64) + np.isin(outcome, LATE)
         order = np.argsort(table["receipt_ns"], kind="stable")
         order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
+        (shown,) = _thinned(
+            [Columns({"receipt_ns": table["receipt_ns"][order], "row": order})],
+            "receipt_ns",
+            most,
+            f"{one.label}, detections",
+            notes,
+        )
+        order = shown["row"]
         return {
             "sensors": sensors.tolist(),
             "detections": {

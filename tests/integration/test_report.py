@@ -240,10 +240,10 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
 def test_long_runs_are_thinned_and_it_is_reported(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fgtrack.show.playback.MOST_ROWS", 100)
+    monkeypatch.setattr("fgtrack.show.playback.MOST_ROWS", 20)
     shown, notes = playback(evaluated(folder / "runs" / NAMES[0]))
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
-    step = -(-run.tables["tracks"].num_rows // 100)
+    step = -(-run.tables["tracks"].num_rows // 20)
     assert step > 1
     ticks_s = (
         run.tables["timing"]["now_ns"][::step] - int(shown["recordings"][0]["start_ns"])
@@ -254,6 +254,14 @@ def test_long_runs_are_thinned_and_it_is_reported(
         note.startswith(f"{NAMES[0]}: the viewer shows one time in {step}")
         for note in notes
     )
+    receipts_ns = run.tables["detections"]["receipt_ns"]
+    step = -(-len(receipts_ns) // 20)
+    assert step > 1
+    kept_ns = np.unique(receipts_ns)[::step]
+    found = shown["runs"][0]["detections"]
+    assert len(found["receipt"]) == np.isin(receipts_ns, kept_ns).sum()
+    assert len(set(found["receipt"])) == len(kept_ns)
+    assert any(f"{NAMES[0]}, detections: " in note for note in notes)
 
 
 def test_names_from_outside_are_text(folder: Path, tmp_path: Path) -> None:
