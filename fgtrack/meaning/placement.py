@@ -408,6 +408,8 @@ def _mount_decision(
     reference = mounts.references.get(name, name)
     is_placed = mounts.is_placed(name)
     against = "" if reference == name else f"against {reference}: "
+    if against and reference not in mounts.known and not mounts[reference].is_known:
+        against = f"against {reference}, whose lever arm is assumed: "
     if _is_read_in_ego(sample, name):
         # The recording itself puts the sensor into the ego, so nothing is changed.
         if item.is_off and is_placed and reference != name:

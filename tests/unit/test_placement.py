@@ -132,3 +132,12 @@ def test_sensors_that_agree_on_a_turned_axis_are_mounted_by_the_traffic() -> Non
     found = decisions(1, top, radar, parked=1)
     assert yaw_rad(found["top"]) == pytest.approx(math.pi / 2, abs=0.03)
     assert "radar" not in found or found["radar"].certainty == "tested"
+
+
+def test_a_mount_against_an_assumed_lever_arm_names_the_assumption() -> None:
+    left = Sensor("left", 0.6, 3.0, 0.8, half_view_rad=1.3, clutter=0.2)
+    right = Sensor("right", -0.6, 3.0, -0.8, half_view_rad=1.3, clutter=0.2)
+    found = decisions(2, left, right, parked=1)
+    reasons = sorted(item.reason for item in found.values())
+    assert "whose lever arm is assumed" in reasons[0]
+    assert "objects stand still or move along" in reasons[1]
