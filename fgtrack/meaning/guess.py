@@ -105,6 +105,27 @@ _VEHICLE_AXES = {
     "lat": "y",
     "lateral": "y",
 }
+#: Words before `id` that identify something else than an object.
+_OF_OTHER_IDS = frozenset(
+    (
+        "frame",
+        "class",
+        "type",
+        "category",
+        "label",
+        "sensor",
+        "camera",
+        "radar",
+        "lidar",
+        "channel",
+        "message",
+        "msg",
+        "scan",
+        "list",
+        "sequence",
+        "source",
+    )
+)
 _AXES = {
     "x": ("x_m", "velocity x", "length_m"),
     "y": ("y_m", "velocity y", "width_m"),
@@ -372,6 +393,8 @@ def _component(name: str) -> tuple[str | None, str]:
         return (None if context & _OF_OTHER else _AXES[axis][kind] or None), unit
     text = "_".join(base)
     if len(base[-1]) == 1 and len(base) > 1:
+        return None, unit
+    if base[-1] == "id" and _OF_OTHER_IDS & set(base[-2:-1]):
         return None, unit
     for component, names in _NAMES.items():
         if re.fullmatch(f"(?:.*_)?(?:{names})", text):

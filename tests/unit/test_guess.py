@@ -110,6 +110,13 @@ def test_the_unit_of_times_is_that_of_their_size_name_or_period(name, samples, u
     assert time_unit(name, samples)[0] == unit
 
 
+@pytest.mark.parametrize("name", ["header.frame_id", "class_id", "sensorId", "msg_id"])
+def test_an_id_of_something_else_is_no_object(name: str) -> None:
+    found = guesses({name: [0.0, 1.0], "track_id": [4.0, 5.0]})
+    assert found["object_id"].path == "track_id"
+    assert guesses({name: [0.0, 1.0]}) == {}
+
+
 @pytest.mark.parametrize("compass", [True, False])
 @pytest.mark.parametrize("degrees", [True, False])
 def test_a_heading_and_a_speed_are_those_with_which_the_positions_move(
