@@ -30,6 +30,15 @@ class DetectionsInMap:
     bearing_rad: FloatArray
     """Direction from the sensor, shape (n,); NaN if not measured."""
 
+    def of(self, rows: IntArray) -> "DetectionsInMap":
+        """Return the detections of `rows`."""
+        return DetectionsInMap(
+            self.position_m[rows],
+            self.yaw_rad[rows],
+            self.sensor_m[rows],
+            self.bearing_rad[rows],
+        )
+
 
 def detections_in_map(run: Run) -> DetectionsInMap:
     """Return the detections of `run` in the map frame.

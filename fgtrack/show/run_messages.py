@@ -1,7 +1,7 @@
 """Messages that show a run: map, ego, truth, tracks with uncertainty, lagged states, detections."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from heapq import merge
@@ -20,6 +20,7 @@ from fgtrack.core.types import (
     Detection,
     Disposition,
     EgoState,
+    FloatArray,
     IntArray,
 )
 from fgtrack.evaluation.placement import (
@@ -307,13 +308,33 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
     rows = update_rows(run)
     # Row -1 selects the empty text at the end.
     dispositions = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")
-    fates = dispositions[rows].tolist()
+    # NaN without a position or a track.
+    off_m = track_positions(run, rows) - where.position_m
     colours = {
         name: rgba(SENSORS[k % len(SENSORS)])
         for k, name in enumerate(np.unique(table["sensor"]).tolist())
     }
-    # NaN without a position or a track.
-    off_m = track_positions(run, rows) - where.position_m
+    receipts_ns = table["receipt_ns"]
+    for block in _blocks(receipts_ns, np.unique(receipts_ns)):
+        yield from _list_messages(
+            table.where(block),
+            where.of(block),
+            off_m[block],
+            dispositions[rows[block]].tolist(),
+            colours,
+            layer,
+        )
+
+
+def _list_messages(
+    table: Columns,
+    where: DetectionsInMap,
+    off_m: FloatArray,
+    fates: Sequence[str],
+    colours: Mapping[str, Colour],
+    layer: RunLayer,
+) -> Messages:
+    """Yield the messages of the lists in `table`; `off_m` (n, 2) leads from each detection to its track."""
     lengths_m = np.hypot(*off_m.T).tolist()
     yaws_rad = np.arctan2(off_m[:, 1], off_m[:, 0]).tolist()
     positions_m: list[Point] = list(map(tuple, where.position_m.tolist()))
