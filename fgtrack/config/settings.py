@@ -21,7 +21,11 @@ from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.association import (
+    GatedEuclidean,
+    GatedMahalanobis,
+    Hypotheses,
+)
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.lives.counters import LifecycleRules
@@ -38,7 +42,8 @@ MergeConfig = Annotated[
     ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")
 ]
 AssociationConfig = Annotated[
-    GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")
+    GatedEuclidean | GatedMahalanobis | Hypotheses | UngatedEuclidean,
+    Discriminator("kind"),
 ]
 _Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 

@@ -30,7 +30,12 @@ from fgtrack.karle2023.tracker_parts import (
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
-from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.association import GatedMahalanobis, Hypotheses
+from fgtrack.tracking.decided_tracker import DecidedTracker
+from fgtrack.tracking.decisions.entries import decision_motion
+from fgtrack.tracking.decisions.history import Decisions
+from fgtrack.tracking.decisions.lives import DecidedLives
+from fgtrack.tracking.decisions.steps import BirthPrior, Rules
 from fgtrack.tracking.ego.growth import EgoGrowth
 from fgtrack.tracking.ego.trajectory import EgoStd, EgoTrajectory
 from fgtrack.tracking.ego.waiting import PoseWait
@@ -43,7 +48,7 @@ from fgtrack.tracking.lives.existence import (
     ExistenceRules,
     Lifecycle,
 )
-from fgtrack.tracking.lives.latency import Watermarks
+from fgtrack.tracking.lives.latency import Views, Watermarks
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.tracker import MultiObjectTracker
@@ -63,6 +68,7 @@ def build_tracker(
             )
     road = build_road(config.map, config.defects)
     motion = config.motion_model()
+    decides = isinstance(config.association, Hypotheses)
     lifecycle = build_lifecycle(config)
     failures = Failures()
     published_order = config.lifecycle.kind == "published"
@@ -97,15 +103,54 @@ def build_tracker(
         road=road,
         watermarks=Watermarks(config.sensors, [EGO]),
     )
-    return (PublishedTracker if published_order else MultiObjectTracker)(
-        parts if observed is None else observed(parts)
+    parts = parts if observed is None else observed(parts)
+    if decides:
+        rules = _decision_rules(config)
+        return DecidedTracker(parts, Decisions(rules, len(config.sensors)))
+    return (PublishedTracker if published_order else MultiObjectTracker)(parts)
+
+
+def _decision_rules(config: Config) -> Rules:
+    """Return the numbers of decisions; raises `CallError` for a lifecycle that counts."""
+    own, birth = config.lifecycle, config.birth
+    if not isinstance(own, ExistenceRules) or not isinstance(
+        config.association, Hypotheses
+    ):
+        raise CallError(
+            "association.kind: hypotheses needs the probabilities of lifecycle.kind: existence"
+        )
+    motion = decision_motion(config.motion.model(config.used_sensors))
+    prior = None
+    if birth.appearances_per_s is not None:
+        mean, std = np.zeros(motion.dim), np.ones(motion.dim)
+        for row, name in enumerate(motion.state_names):
+            mean[row] = birth.mean.get(name, 0.0)
+            std[row] = birth.std.get(name, motion.start_variance(name) ** 0.5)
+        prior = BirthPrior(birth.appearances_per_s, mean, np.diag(std**2))
+    odds = own.birth_probability / (1.0 - own.birth_probability)
+    return Rules(
+        motion,
+        Views(config.sensors, config.ego.detection_origin_m),
+        config.association.most,
+        own.lifetime_s,
+        own.visible_share,
+        own.visible_s,
+        own.out_of_view_s,
+        own.hidden_s,
+        own.delete_probability,
+        own.confirm_probability,
+        odds,
+        own.min_travel_m,
+        prior,
     )
 
 
-def build_lifecycle(config: Config) -> Lifecycle:
+def build_lifecycle(config: Config) -> Lifecycle | DecidedLives:
     """Return the lifecycle, which confirms and ends tracks."""
     rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
+        if isinstance(config.association, Hypotheses):
+            return DecidedLives(rules)
         return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)
     kind = PublishedLifecycle if rules.kind == "published" else CountingLifecycle
     return kind(rules, config.sensors, config.ego.detection_origin_m)

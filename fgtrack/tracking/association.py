@@ -239,11 +239,34 @@ class GatedMahalanobis(Association):
             )
             likely = more <= chi_square_quantile(self.gate_probability, largest)
             pairs, more = pairs.at(likely), more[likely]
-        limits = partial(_quantiles, self.gate_probability)
+        limits = partial(quantiles, self.gate_probability)
         cost, inside, readings = weighed(
             pairs, candidates, states, facings, limits, more
         )
         return pairs._replace(values=cost).at(inside), readings
+
+
+@settings
+class Hypotheses(Association):
+    """Decisions by the likeliest of a few hypotheses about all detections inside the horizon.
+
+    Each hypothesis says which detections belong together, which are clutter, and which objects exist (a Poisson
+    multi-Bernoulli mixture). Lists count in the order of their stamps: a late list changes the decisions about newer
+    ones. It needs `lifecycle.kind: existence`.
+    """
+
+    kind: Literal["hypotheses"] = "hypotheses"
+    most: PositiveInt = 8
+    """Largest number of hypotheses."""
+
+    @property
+    def reads_yaws(self) -> bool:
+        """See `Association`."""
+        return True
+
+    def assign(self, problem: AssociationProblem) -> Assignment:
+        """Not used: the tracker decides about lists, see `fgtrack.tracking.decisions`."""
+        raise NotImplementedError
 
 
 def claimed(
@@ -281,7 +304,7 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 
 @cache
-def _quantiles(probability: float, most: int) -> FloatArray:
+def quantiles(probability: float, most: int) -> FloatArray:
     """Return `chi_square_quantile` for 0 to `most` degrees of freedom, shape (most + 1,)."""
     return np.array(
         [

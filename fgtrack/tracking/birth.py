@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -47,6 +47,14 @@ class Birth:
     """Standard deviation of the position along the heading (`kind: fixed`)."""
     across_std_m: PositiveFloat = 0.1
     """Standard deviation of the position across the heading (`kind: fixed`)."""
+
+    appearances_per_s: PositiveFloat | None = None
+    """Number of objects that appear in a second, at `mean` with `std`; null if objects appear anywhere. It serves
+    `association.kind: hypotheses`."""
+    mean: Mapping[str, float] = field(default_factory=dict)
+    """Mean of the first state of objects that appear: `x_m`, `y_m`, `vx_mps` and `vy_mps`."""
+    std: Mapping[str, PositiveFloat] = field(default_factory=dict)
+    """Standard deviations of the same entries."""
 
     def prior(
         self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool

@@ -25,6 +25,16 @@ _MOST_STRAYS = 3  # where one in ten is an outlier, four in a row are as improba
 _MOST_FORMER = 10_000  # ended tracks that are remembered, the last ones
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
+
+
+def differ(first: str | None, second: str | None) -> bool:
+    """Return True for two classes that a detector does not confuse; None is an unknown class."""
+    if first is None or second is None:
+        return False
+    a, b = first.lower(), second.lower()
+    return _GROUPS.get(a, a) != _GROUPS.get(b, b)
+
+
 _sizes_m = attrgetter(*_SIZES)
 _description = attrgetter("class_name", "id", *_SIZES)
 _NO_DESCRIPTION = None, None, None, None, None

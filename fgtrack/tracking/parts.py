@@ -16,6 +16,7 @@ from fgtrack.tracking.ego.waiting import PoseWait
 from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
+from fgtrack.tracking.decisions.lives import DecidedLives
 from fgtrack.tracking.lives.existence import Lifecycle
 from fgtrack.tracking.lives.latency import Watermarks
 from fgtrack.tracking.objects import Objects
@@ -33,7 +34,7 @@ class TrackerParts:
     association: Association
     bank: GuardedBank
     motion: MotionModel
-    lifecycle: Lifecycle
+    lifecycle: Lifecycle | DecidedLives
     suppress_births_near_newer_tracks: bool
     birth: Birth
     road: Road

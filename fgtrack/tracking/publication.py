@@ -39,7 +39,8 @@ class Publication:
     def smoothed(self) -> Sequence[SmoothedReport]:
         """Return the smoothed states that are due."""
         reports, facing = self._parts.bank.smoothed(), self._parts.facing
-        return reports if facing is None else facing.smoothed(reports)
+        turned = reports if facing is None else facing.smoothed(reports)
+        return self._tracks.published(turned)
 
     def at(self, states: StatesAt, stamp_ns: int) -> tuple[TrackReport, ...]:
         """Return the reports of tracks at a stamp, from their `states` at this stamp.
@@ -69,7 +70,7 @@ class Publication:
         return partial(
             map,
             TrackReport,
-            track_ids,
+            [self._tracks.public(each) for each in track_ids],
             statuses,
             states,
             num_measured,

@@ -3,12 +3,13 @@
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from fgtrack.core.state import Stateful
-from fgtrack.core.types import BoolArray, Detection, IntArray
+from fgtrack.core.types import BoolArray, Detection, IntArray, SmoothedReport
 from fgtrack.estimation.base import Measurements, Start, StatesAt, UpdateResult
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.filters.ekf import correct_one
@@ -26,6 +27,9 @@ class Tracks(Stateful):
         "_undirected",
         "_directed",
         "_newborn",
+        "_public",
+        "_bank_ids",
+        "_dropped",
     )
 
     def __init__(self, parts: TrackerParts) -> None:
@@ -39,6 +43,41 @@ class Tracks(Stateful):
         self._directed: dict[int, tuple[Start, int]] = {}
         # Sensors of first positions, and stamps of second ones, by id.
         self._newborn: dict[int, tuple[str, int]] = {}
+        # Public numbers of tracks, by their numbers in the bank, and the reverse.
+        self._public: dict[int, int] = {}
+        self._bank_ids: dict[int, int] = {}
+        # Tracks whose last smoothed states are not to be published.
+        self._dropped: set[int] = set()
+
+    def name(self, bank_id: int, public: int) -> None:
+        """Publish the track `bank_id` of the bank as `public`."""
+        self._public[bank_id], self._bank_ids[public] = public, bank_id
+
+    def bank_id(self, public: int) -> int | None:
+        """Return the track of the bank that is published as `public`; None without one."""
+        found = self._bank_ids.get(public)
+        return found if found is not None and self._parts.bank.holds(found) else None
+
+    def public(self, bank_id: int) -> int:
+        """Return the number under which a track of the bank is published."""
+        return self._public.get(bank_id, bank_id)
+
+    def drop(self, bank_id: int) -> None:
+        """End a track that is estimated again, or was none; its last smoothed states are not published."""
+        self._dropped.add(bank_id)
+        self.end([bank_id])
+
+    def published(self, reports: Sequence[SmoothedReport]) -> list[SmoothedReport]:
+        """Return smoothed states of the bank as they are published."""
+        if not (self._public or self._dropped):
+            return list(reports)
+        kept = [
+            replace(each, track_id=self.public(each.track_id))
+            for each in reports
+            if each.track_id not in self._dropped
+        ]
+        self._dropped = set()
+        return kept
 
     def number(self, detection: Detection) -> int:
         """Return the number of a new track. A former track with the identity of `detection` passes on its number."""

@@ -1,0 +1,419 @@
+"""A tracker whose estimators follow decisions about all lists inside the horizon."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import ClassVar, cast
+
+import numpy as np
+
+from fgtrack.core.types import Disposition, EgoState, UpdateRecord
+from fgtrack.estimation.base import Start, StatesAt
+from fgtrack.estimation.failures import Failure
+from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
+from fgtrack.tracking.decisions.entries import Entry
+from fgtrack.tracking.decisions.history import Decisions, Explained
+from fgtrack.tracking.decisions.lives import DecidedLives, Life
+from fgtrack.tracking.decisions.steps import NONE
+from fgtrack.tracking.detections import PosedBatch
+from fgtrack.tracking.inbox import record
+from fgtrack.tracking.lives.counters import Scan
+from fgtrack.tracking.parts import TrackerParts
+from fgtrack.tracking.preprocess import Candidates, Preprocessed
+from fgtrack.tracking.tracker import MultiObjectTracker
+
+_FIRST_REBUILT = 1_000_000_000
+_GATE_PROBABILITY = 0.9999
+
+
+class DecidedTracker(MultiObjectTracker):
+    """Decides about all lists in the order of their stamps, and lets the estimators follow.
+
+    A late list changes decisions about newer lists. A track whose detections have changed is estimated again from its
+    first detection.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *MultiObjectTracker.STATE,
+        "decisions",
+        "_public",
+        "_roots",
+        "_next_public",
+        "_next_rebuilt",
+        "revisions",
+    )
+
+    def __init__(self, parts: TrackerParts, decisions: Decisions) -> None:
+        super().__init__(parts)
+        self.decisions = decisions
+        self._lives = cast(DecidedLives, parts.lifecycle)
+        self._public: dict[int, int] = {}
+        """Public number of each root."""
+        self._roots: dict[int, int] = {}
+        """Root of each public number."""
+        self._next_public = 0
+        self._next_rebuilt = _FIRST_REBUILT
+        self.revisions = 0
+        """Number of detections whose track was changed later."""
+
+    def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+        """Decide about one list, and fuse its detections."""
+        parts, batch, ego = self._parts, posed.batch, posed.ego
+        message = batch.message
+        if ego is None and message.frame != "map":
+            self._records.append(
+                [record(message, index, Disposition.FAILED) for index in batch.indices]
+            )
+            return
+        scan = Scan(
+            message.sensor, batch.stamp_ns, parts.bank.present_ns, ego, message.objects
+        )
+        candidates, out_of_bounds = (
+            preprocessed or parts.preprocess.together([posed])[0]
+        )
+        self._records.append(out_of_bounds)
+        self._forget()
+        if self._is_too_old(batch) or self.decisions.is_too_old(batch.stamp_ns):
+            every = range(len(candidates))
+            self._records += candidates.records(batch, every, Disposition.TOO_OLD)
+            return
+        entry = self._entry(posed, candidates, scan)
+        self._follow(entry, self.decisions.add(entry))
+
+    def _forget(self) -> None:
+        """Decide for good about lists that no late list can precede."""
+        oldest_ns = self._parts.bank.window_start_ns
+        self.decisions.forget(oldest_ns)
+        self._tracks.end(self._lives.ended_before(oldest_ns))
+
+    def _entry(self, posed: PosedBatch, candidates: Candidates, scan: Scan) -> Entry:
+        """Return a list ready for decisions."""
+        parts, sensor = self._parts, posed.sensor
+        scores = np.zeros(len(candidates))
+        if sensor.score is not None:
+            for position in range(len(candidates)):
+                own = [
+                    each.score
+                    for each in candidates.described(posed.batch, position)
+                    if each.score is not None
+                ]
+                if own:
+                    score = (max(own) - sensor.score.even) / sensor.score.scale
+                    scores[position] = min(max(score, -10.0), 10.0)
+        may_start = np.array(candidates.placed, dtype=bool) & sensor.births
+        ego, in_pit = self._ego(scan), parts.ego.in_pit
+
+        def start(position: int) -> Start | None:
+            return parts.birth.prior(candidates[position], parts.road, ego, in_pit)
+
+        return Entry(
+            posed.batch,
+            candidates,
+            scan,
+            sensor,
+            list(parts.sensors).index(scan.sensor),
+            self.decisions.motion,
+            scores,
+            may_start,
+            start,
+        )
+
+    def _ego(self, scan: Scan) -> EgoState | None:
+        """Return the ego at the stamp of a list."""
+        pose, current = scan.ego, self._parts.ego.current
+        if pose is None:
+            return None
+        return EgoState(
+            scan.stamp_ns,
+            scan.stamp_ns,
+            *pose[:5],
+            accel_mps2=0.0 if current is None else current.accel_mps2,
+        )
+
+    def _follow(self, entry: Entry, changes: Sequence[Explained]) -> None:
+        """Let the estimators follow the decisions, and record the detections of `entry`."""
+        named = self._named(changes)
+        self._revise(entry, changes, named)
+        self._update_lives(entry.batch.stamp_ns)
+        self._record(entry)
+
+    def _named(self, changes: Sequence[Explained]) -> list[list[int | None]]:
+        """Return the public track of each candidate of the changed lists. New tracks get numbers."""
+        unknown: dict[int, Counter[int]] = {}
+        for each in changes:
+            for root, old in zip(each.taken, each.entry.published, strict=True):
+                if root != NONE and root not in self._public:
+                    votes = unknown.setdefault(root, Counter())
+                    if old is not None:
+                        votes[old] += 1
+        if any(unknown.values()):
+            present = self._present_roots(changes)
+            for root, votes in unknown.items():
+                for public, _ in votes.most_common():
+                    if self._roots.get(public) not in present:
+                        self._public.pop(self._roots.get(public, NONE), None)
+                        self._public[root], self._roots[public] = public, root
+                        break
+        named: list[list[int | None]] = []
+        for each in changes:
+            own: list[int | None] = []
+            for root in each.taken:
+                if root == NONE:
+                    own.append(None)
+                    continue
+                if root not in self._public:
+                    self._public[root] = self._next_public
+                    self._roots[self._next_public] = root
+                    self._next_public += 1
+                own.append(self._public[root])
+            named.append(own)
+        return named
+
+    def _present_roots(self, changes: Sequence[Explained]) -> set[int]:
+        """Return the roots of all tracks in the decisions as they are now."""
+        changed = {id(each.entry) for each in changes}
+        present = {root for each in changes for root in each.taken}
+        for entry in self.decisions.entries:
+            if id(entry) not in changed:
+                present.update(
+                    self._roots[public]
+                    for public in entry.published
+                    if public is not None and public in self._roots
+                )
+        nodes = self.decisions.nodes
+        if nodes is not None:
+            present.update(nodes.roots.tolist())
+        return present
+
+    def _revise(
+        self,
+        entry: Entry,
+        changes: Sequence[Explained],
+        named: Sequence[list[int | None]],
+    ) -> None:
+        """Estimate the tracks whose detections have changed again, and publish the decisions."""
+        again: set[int] = set()
+        added: list[tuple[Entry, list[int]]] = []
+        for each, own in zip(changes, named, strict=True):
+            before = each.entry.published
+            is_new = each.entry is entry
+            new_positions = []
+            for position, (public, old) in enumerate(zip(own, before, strict=True)):
+                if public == old:
+                    continue
+                if not is_new:
+                    self.revisions += 1
+                if old is not None:
+                    again.add(old)
+                if public is not None:
+                    is_birth = each.taken[position] == each.entry.roots[position]
+                    if is_birth and not (is_new and self._is_unknown(public)):
+                        again.add(public)
+                    new_positions.append(position)
+            each.entry.published = own
+            if new_positions:
+                added.append((each.entry, new_positions))
+        self._results: dict[int, UpdateRecord] = {}
+        for public in sorted(again):
+            self._rebuild(public, entry)
+        for each_entry, positions in added:
+            rest = [p for p in positions if each_entry.published[p] not in again]
+            births = [
+                p
+                for p in rest
+                if self._roots[cast(int, each_entry.published[p])]
+                == each_entry.roots[p]
+            ]
+            self._fuse(
+                each_entry, [p for p in rest if p not in births], each_entry is entry
+            )
+            for position in births:
+                self._birth(each_entry, position)
+
+    def _is_unknown(self, public: int) -> bool:
+        """True for a track that no estimator holds."""
+        return self._tracks.bank_id(public) is None
+
+    def _rebuild(self, public: int, newest: Entry | None = None) -> None:
+        """Estimate a track again from its first detection.
+
+        The detections of a track that began before the horizon cannot all be fused again, so it keeps its state.
+        """
+        root = self._roots.get(public)
+        bank_id = self._tracks.bank_id(public)
+        dets = [
+            (entry, position)
+            for entry in self.decisions.entries
+            for position, each in enumerate(entry.published)
+            if each == public
+        ]
+        if dets and dets[0][0].roots[dets[0][1]] != root and bank_id is not None:
+            for entry, position in dets:
+                if entry is newest:
+                    self._fuse(entry, [position], is_recorded=True)
+            return
+        if bank_id is not None:
+            self._tracks.drop(bank_id)
+        for k, (entry, position) in enumerate(dets):
+            if k == 0:
+                self._birth(entry, position, is_again=True)
+            else:
+                self._fuse(entry, [position], entry is newest)
+
+    def _birth(self, entry: Entry, position: int, is_again: bool = False) -> None:
+        """Start the estimator of a track."""
+        public = cast(int, entry.published[position])
+        start = entry.start(position)
+        if start is None:
+            return
+        bank_id = public
+        if is_again:
+            bank_id = self._next_rebuilt
+            self._next_rebuilt += 1
+        parts = self._parts
+        try:
+            parts.bank.birth(bank_id, start)
+            if not parts.bank.holds(bank_id):
+                return
+            self._tracks.name(bank_id, public)
+            candidate = entry.candidates[position]
+            self._tracks.begin(bank_id, entry.scan.sensor, start)
+            if parts.facing is not None:
+                parts.facing.born(
+                    bank_id, entry.scan.sensor, start, candidate.measurement
+                )
+            parts.objects.learn(
+                bank_id, entry.candidates.described(entry.batch, position)
+            )
+        except Exception as error:
+            parts.contain(error, Failure.BIRTH_FAILED)
+            self._tracks.end([bank_id])
+
+    def _fuse(self, entry: Entry, positions: Sequence[int], is_recorded: bool) -> None:
+        """Fuse candidates of a list with their tracks."""
+        chosen: list[tuple[int, int]] = []
+        for position in positions:
+            bank_id = self._tracks.bank_id(cast(int, entry.published[position]))
+            if bank_id is not None:
+                chosen.append((position, bank_id))
+        if not chosen:
+            return
+        parts, stamp_ns = self._parts, entry.batch.stamp_ns
+        known = (
+            parts.bank.state_of(chosen[0][1], stamp_ns)
+            if len(chosen) == 1
+            else parts.bank.states_at(stamp_ns)
+        )
+        states = self._tracks.in_any_direction(known, stamp_ns)
+        index = {each: k for k, each in enumerate(states.track_ids)}
+        pairs = [(p, index[bank_id]) for p, bank_id in chosen if bank_id in index]
+        if not pairs:
+            return
+        assignment = self._readings(entry, pairs, states)
+        records: list[Iterable[UpdateRecord]] = []
+        self._update.fuse(entry.batch, entry.candidates, assignment, states, records)
+        if parts.objects.describes(entry.scan.objects):
+            for position, track in pairs:
+                parts.objects.learn(
+                    states.track_ids[track],
+                    entry.candidates.described(entry.batch, position),
+                )
+        if is_recorded:
+            for made in records:
+                for one in made:
+                    self._results[one.index] = one
+
+    def _readings(
+        self, entry: Entry, pairs: list[tuple[int, int]], states: StatesAt
+    ) -> Assignment:
+        """Return the assignment of `pairs` with the readings of their yaws."""
+        facing = self._parts.facing
+        assignment = Assignment(pairs, [], [])
+        if facing is None:
+            return assignment
+        facings = facing.at(entry.scan.sensor, states.track_ids)
+        rows, columns = np.array(pairs).T
+        _, _, readings = weighed(
+            Pairs(rows, columns, np.zeros(len(rows))),
+            entry.candidates,
+            states,
+            facings,
+            partial(quantiles, _GATE_PROBABILITY),
+        )
+        return assignment._replace(readings=tuple(readings))
+
+    def _update_lives(self, stamp_ns: int) -> None:
+        """Note which tracks live, and end the others."""
+        step = self.decisions.newest
+        if step is None:
+            return
+        living = set[int]()
+        rows = step.hypotheses[0].rows.tolist()
+        nodes = step.nodes
+        matched = set(step.hypotheses[0].taken)
+        for row in rows:
+            root = int(nodes.roots[row])
+            public = self._public.get(root)
+            if public is None:
+                continue
+            if self._tracks.bank_id(public) is None:
+                self._rebuild(public)
+            bank_id = self._tracks.bank_id(public)
+            if bank_id is None:
+                continue
+            living.add(bank_id)
+            self._lives.live(
+                bank_id,
+                Life(
+                    float(nodes.existed[row] * nodes.alive[row]),
+                    step.stamp_ns,
+                    float(nodes.hazards_hz[row]),
+                    bool(nodes.is_confirmed[row]),
+                    root not in matched,
+                ),
+            )
+        roots = {root for entry in self.decisions.entries for root in entry.roots}
+        for each in self._parts.bank.track_ids:
+            if each in living or self._lives.is_suspended(each):
+                continue
+            life = self._lives.lives.get(each)
+            was_confirmed = life is not None and life.is_confirmed
+            root = self._roots.get(self._tracks.public(each))
+            if root in roots and not was_confirmed:
+                self._tracks.drop(each)
+            else:
+                self._lives.suspend(each, step.stamp_ns)
+
+    def _record(self, entry: Entry) -> None:
+        """Record what has become of the detections of a list."""
+        batch, candidates = entry.batch, entry.candidates
+        for position, public in enumerate(entry.published):
+            leader = candidates.leaders[position]
+            if public is None:
+                self._records += candidates.records(
+                    batch, [position], Disposition.GATED
+                )
+                continue
+            fused = self._results.get(leader)
+            if fused is not None:
+                own = UpdateRecord(
+                    fused.sensor,
+                    fused.stamp_ns,
+                    fused.receipt_ns,
+                    fused.index,
+                    fused.disposition,
+                    public,
+                    fused.nis,
+                    fused.innovation,
+                    yaw=fused.yaw,
+                )
+                others = candidates.records(
+                    batch, [position], Disposition.BIRTH, public
+                )
+                self._records.append((own, *others[0][1:]))
+                continue
+            is_birth = self._roots.get(public) == entry.roots[position]
+            disposition = Disposition.BIRTH if is_birth else Disposition.FAILED
+            self._records += candidates.records(
+                batch, [position], disposition, public if is_birth else None
+            )

@@ -1,0 +1,202 @@
+"""One object list, ready for decisions."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.types import BoolArray, Detection, FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CT, MotionModel
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.inbox import Batch
+from fgtrack.tracking.lives.counters import Scan
+from fgtrack.tracking.preprocess import Candidates, Group, StampError
+
+#: Components that a velocity along the axes of the map does not show well at low speed, or that are no measurement.
+_LEFT_OUT = {"yaw_rad", "curvature_radpm"}
+_SPEED_OF_CLUTTER_MPS = 30.0
+
+
+def decision_motion(motion: MotionModel) -> MotionModel:
+    """Return the motion model of decisions: `motion`, or `CT` with its noise for a state with yaw and speed.
+
+    A first position says nothing of a direction. A Cartesian velocity expresses this without an assumed yaw.
+    """
+    if motion.cartesian:
+        return motion
+    noise = {
+        "position_density_m2ps": "position_density_m2ps",
+        "velocity_density_m2ps3": "speed_density_m2ps3",
+        "yaw_rate_density_rad2ps3": "yaw_rate_density_rad2ps3",
+        "yaw_rate_std_radps": "yaw_rate_std_radps",
+    }
+    given = {
+        own: getattr(motion, theirs)
+        for own, theirs in noise.items()
+        if hasattr(motion, theirs)
+    }
+    return CT(**given)
+
+
+class Description(NamedTuple):
+    """Class and identity that most detections of a track have given; None without one."""
+
+    classes: Mapping[str, int]
+    ids: Mapping[str, int]
+
+    @property
+    def class_name(self) -> str | None:
+        """The most frequent class."""
+        return _most(self.classes)
+
+    @property
+    def identity(self) -> str | None:
+        """The most frequent identity."""
+        return _most(self.ids)
+
+    def learned(self, other: "Description") -> "Description":
+        """Return the description by both."""
+        return Description(_sum(self.classes, other.classes), _sum(self.ids, other.ids))
+
+
+NOTHING = Description({}, {})
+
+
+def described(detections: Iterable[Detection]) -> Description:
+    """Return the description by `detections`."""
+    classes: dict[str, int] = {}
+    ids: dict[str, int] = {}
+    for each in detections:
+        if each.class_name is not None:
+            classes[each.class_name] = classes.get(each.class_name, 0) + 1
+        if each.id is not None:
+            ids[each.id] = ids.get(each.id, 0) + 1
+    return Description(classes, ids) if classes or ids else NOTHING
+
+
+def _sum(a: Mapping[str, int], b: Mapping[str, int]) -> Mapping[str, int]:
+    if not b:
+        return a
+    return {key: a.get(key, 0) + b.get(key, 0) for key in {**a, **b}}
+
+
+def _most(counts: Mapping[str, int]) -> str | None:
+    return max(sorted(counts), key=counts.__getitem__) if counts else None
+
+
+@dataclass(eq=False)
+class Entry:
+    """An object list with its candidates."""
+
+    batch: Batch
+    candidates: Candidates
+    scan: Scan
+    sensor: SensorModel
+    index: int
+    """Number of the sensor."""
+    motion: MotionModel
+    scores: FloatArray
+    """Logarithms of p(score | object) / p(score | clutter), shape (m,)."""
+    may_start: BoolArray
+    """True for each candidate that may start a track, shape (m,)."""
+    make_start: Callable[[int], Start | None]
+    """Returns the first state of the track that a candidate would start; None without one."""
+    roots: list[int] = field(default_factory=list)
+    """Numbers of the tracks that the candidates would start."""
+    published: list[int | None] = field(default_factory=list)
+    """Track of each candidate in the published decisions; None without one."""
+
+    _starts: dict[int, Start | None] = field(default_factory=dict)
+
+    def start(self, position: int) -> Start | None:
+        """Return the first state of the track that a candidate would start; None without one."""
+        if position not in self._starts:
+            self._starts[position] = self.make_start(position)
+        return self._starts[position]
+
+    @cached_property
+    def key(self) -> tuple[int, str, bytes]:
+        """Sort key: stamp, sensor and contents, so that the order of arrival does not matter."""
+        return (
+            self.batch.stamp_ns,
+            self.batch.message.sensor,
+            self.candidates.lines.tobytes(),
+        )
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The measurements of decisions, with their whole errors, in the state of the motion model of decisions."""
+        return [
+            _group(group, self.motion, self.sensor) for group in self.candidates.groups
+        ]
+
+    @cached_property
+    def placed(self) -> BoolArray:
+        """True for each candidate with a position, shape (m,)."""
+        return np.array(self.candidates.placed, dtype=bool)
+
+    @cached_property
+    def log_clutter(self) -> FloatArray:
+        """Logarithm of the density of clutter at each candidate, relative to its score, shape (m,).
+
+        The density is that of the measured components. Clutter is uniform in the directions of a bearing.
+        """
+        per_m2 = math.log(self.sensor.clutter_per_m2)
+        result = np.where(self.placed, per_m2, -math.log(math.tau)) - self.scores
+        for group in self.groups:
+            result[group.rows] += _log_others(group)
+        return result
+
+    @cached_property
+    def descriptions(self) -> list[Description]:
+        """Classes and identities of the candidates."""
+        return [
+            described(self.candidates.described(self.batch, position))
+            for position in range(len(self.candidates))
+        ]
+
+    @cached_property
+    def is_described(self) -> bool:
+        """True if a candidate has a class or an identity."""
+        return any(each is not NOTHING for each in self.descriptions)
+
+
+def _group(group: Group, motion: MotionModel, sensor: SensorModel) -> Group:
+    """Return `group` with the components that decisions use."""
+    own = group.stack
+    names = own.model.components
+    kept = [
+        row
+        for row, name in enumerate(names)
+        if name not in _LEFT_OUT and name not in own.assumed
+    ]
+    model = measurement_model(tuple(names[row] for row in kept), motion)
+    z = np.ascontiguousarray(own.z[:, kept])
+    R = np.ascontiguousarray(group.spread[:, kept][:, :, kept])
+    stamp_error = (
+        None
+        if group.stamp_error is None
+        else StampError(motion, group.stamp_error.std_s)
+    )
+    stack = Measurement(own.stamp_ns, model, z, R, own.pose, own.loss)
+    return Group(group.rows, stack, R, None, stamp_error)
+
+
+def _log_others(group: Group) -> FloatArray:
+    """Return the log-density of clutter in the components besides the position, and in polar coordinates, (m,).
+
+    The density of positions per m^2 is that per metre and radian over the range.
+    """
+    names, z = group.stack.model.components, group.stack.z
+    result = np.zeros(len(z))
+    for row, name in enumerate(names):
+        if name == "range_m":
+            result += np.log(np.maximum(z[:, row], 1.0))
+        elif name.endswith("_mps"):
+            result -= math.log(2.0 * _SPEED_OF_CLUTTER_MPS)
+    return result

@@ -1,0 +1,121 @@
+"""Decisions about all lists inside the horizon, in the order of their stamps."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from fgtrack.core.state import Stateful
+from fgtrack.models.motion import MotionModel
+from fgtrack.tracking.decisions.entries import Entry
+from fgtrack.tracking.decisions.steps import (
+    NONE,
+    Nodes,
+    Rules,
+    Step,
+    first_step,
+    following,
+)
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A list whose decisions are new or have changed."""
+
+    entry: Entry
+    taken: tuple[int, ...]
+    """Track of each candidate, by root; `NONE` for clutter."""
+
+
+class Decisions(Stateful):
+    """Keeps the hypotheses after each list, and decides again from the stamp of a late list on.
+
+    A step is never changed, so the step before a late list is its checkpoint.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("_steps", "_first", "_published", "_next_root")
+
+    def __init__(self, rules: Rules, num_sensors: int) -> None:
+        self._rules, self._num_sensors = rules, num_sensors
+        self._steps: list[Step] = []
+        self._first: Step | None = None
+        """Step before the first one that is kept."""
+        self._published: list[int] = []
+        """Hypothesis of each step that is published."""
+        self._next_root = 0
+
+    @property
+    def motion(self) -> MotionModel:
+        """Motion model of the decisions."""
+        return self._rules.motion
+
+    @property
+    def newest(self) -> Step | None:
+        """The step after the newest list."""
+        return self._steps[-1] if self._steps else None
+
+    @property
+    def nodes(self) -> Nodes | None:
+        """Tracks of the best hypothesis after the newest list."""
+        step = self.newest
+        return None if step is None else step.nodes.at(step.hypotheses[0].rows)
+
+    @property
+    def entries(self) -> list[Entry]:
+        """All lists inside the horizon, in the order of their stamps."""
+        return [step.entry for step in self._steps if step.entry is not None]
+
+    def is_too_old(self, stamp_ns: int) -> bool:
+        """True for a stamp before the lists that are decided for good."""
+        return self._first is not None and (
+            self._first.entry is not None and stamp_ns < self._first.stamp_ns
+        )
+
+    def add(self, entry: Entry) -> list[Explained]:
+        """Decide about a list, and again about all newer ones. Return the lists whose decisions are new or changed,
+        the oldest one first.
+        """
+        count = len(entry.candidates)
+        entry.roots = list(range(self._next_root, self._next_root + count))
+        entry.published = [None] * count
+        self._next_root += count
+        if self._first is None:
+            self._first = first_step(
+                self._rules.motion, self._num_sensors, entry.batch.stamp_ns
+            )
+        keys = [each.key for each in self.entries]
+        at = bisect_right(keys, entry.key)
+        step = self._steps[at - 1] if at else self._first
+        steps = []
+        for each in [entry, *self.entries[at:]]:
+            step = following(step, each, self._rules)
+            steps.append(step)
+        self._steps[at:] = steps
+        self._published.insert(at, NONE)
+        return list(self._changes(at))[::-1]
+
+    def _changes(self, at: int) -> Iterator[Explained]:
+        """Yield the lists whose published hypothesis changes, the newest one first.
+
+        The steps from `at` on are new. The published hypothesis of a step is the ancestor of the best one now.
+        """
+        hypothesis = 0
+        for k in range(len(self._steps) - 1, -1, -1):
+            step = self._steps[k]
+            if k < at and self._published[k] == hypothesis:
+                return
+            self._published[k] = hypothesis
+            own = step.hypotheses[hypothesis]
+            if step.entry is not None:
+                yield Explained(step.entry, own.taken)
+            hypothesis = own.parent
+
+    def forget(self, oldest_ns: int) -> list[Entry]:
+        """Decide for good about the lists before `oldest_ns`; return them."""
+        count = bisect_left(self._steps, oldest_ns, key=lambda step: step.stamp_ns)
+        if not count:
+            return []
+        gone = self._steps[:count]
+        self._first = gone[-1]
+        del self._steps[:count], self._published[:count]
+        return [step.entry for step in gone if step.entry is not None]
