@@ -87,6 +87,16 @@ class Correlation:
 
 
 @settings
+class SecondReturns:
+    """Detections of an object besides its first one in a list: the other end of a long hull."""
+
+    share: OpenProbability
+    """Share of the lists with a detection of an object that have a second one of it."""
+    std_m: PositiveFloat
+    """Standard deviation of its distance from the first one, on each axis."""
+
+
+@settings
 class Score:
     """Evidence of a detection's score: log(p(score | object) / p(score | clutter)) = (score - even) / scale.
 
@@ -215,6 +225,8 @@ class SensorModel:
     """
     clutter_per_m2: PositiveFloat = 1e-4
     """False detections per list and square metre (`lifecycle.kind: existence`, `association.joint_from`)."""
+    second_returns: SecondReturns | None = None
+    """Second returns of long objects. null: the sensor gives one detection for each object."""
     score: Score | None = None
     """Evidence of a detection's score for the existence of its object. null: the score is no evidence."""
     near_side_m: float = 0.0

@@ -1,5 +1,6 @@
 """Builds a tracker and its parts from a configuration."""
 
+import math
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from fgtrack.karle2023.tracker_parts import (
     PublishedTracker,
     SlotInbox,
 )
+from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
@@ -35,7 +37,7 @@ from fgtrack.tracking.decided_tracker import DecidedTracker
 from fgtrack.tracking.decisions.entries import decision_motion
 from fgtrack.tracking.decisions.history import Decisions
 from fgtrack.tracking.decisions.lives import DecidedLives
-from fgtrack.tracking.decisions.steps import BirthPrior, Rules
+from fgtrack.tracking.decisions.steps import BirthPrior, Returns, Rules
 from fgtrack.tracking.ego.growth import EgoGrowth
 from fgtrack.tracking.ego.trajectory import EgoStd, EgoTrajectory
 from fgtrack.tracking.ego.waiting import PoseWait
@@ -119,7 +121,9 @@ def _decision_rules(config: Config) -> Rules:
         raise CallError(
             "association.kind: hypotheses needs the probabilities of lifecycle.kind: existence"
         )
-    motion = decision_motion(config.motion.model(config.used_sensors))
+    motion = with_correlated_errors(
+        decision_motion(config.motion.model(config.used_sensors)), config.used_sensors
+    )
     prior = None
     if birth.appearances_per_s is not None:
         mean, std = np.zeros(motion.dim), np.ones(motion.dim)
@@ -128,6 +132,15 @@ def _decision_rules(config: Config) -> Rules:
             std[row] = birth.std.get(name, motion.start_variance(name) ** 0.5)
         prior = BirthPrior(birth.appearances_per_s, mean, np.diag(std**2))
     odds = own.birth_probability / (1.0 - own.birth_probability)
+    returns = {
+        index: Returns(
+            sensor.second_returns.share,
+            sensor.second_returns.std_m,
+            math.log(odds * sensor.clutter_per_m2),
+        )
+        for index, sensor in enumerate(config.sensors.values())
+        if sensor.second_returns is not None
+    }
     return Rules(
         motion,
         Views(config.sensors, config.ego.detection_origin_m),
@@ -141,6 +154,8 @@ def _decision_rules(config: Config) -> Rules:
         own.confirm_probability,
         odds,
         own.min_travel_m,
+        birth.speed_std_mps,
+        returns,
         prior,
     )
 

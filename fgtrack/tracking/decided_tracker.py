@@ -365,7 +365,7 @@ class DecidedTracker(MultiObjectTracker):
             self._lives.live(
                 bank_id,
                 Life(
-                    float(nodes.existed[row] * nodes.alive[row]),
+                    float(nodes.existed[row] * nodes.alive[row] * nodes.own[row]),
                     step.stamp_ns,
                     float(nodes.hazards_hz[row]),
                     bool(nodes.is_confirmed[row]),

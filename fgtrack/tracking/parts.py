@@ -11,12 +11,12 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Association, GatedMahalanobis, Pairs
 from fgtrack.tracking.birth import Birth
+from fgtrack.tracking.decisions.lives import DecidedLives
 from fgtrack.tracking.ego.trajectory import EgoTrajectory
 from fgtrack.tracking.ego.waiting import PoseWait
 from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
-from fgtrack.tracking.decisions.lives import DecidedLives
 from fgtrack.tracking.lives.existence import Lifecycle
 from fgtrack.tracking.lives.latency import Watermarks
 from fgtrack.tracking.objects import Objects

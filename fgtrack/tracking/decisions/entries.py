@@ -1,7 +1,7 @@
 """One object list, ready for decisions."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -10,7 +10,8 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, Detection, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.models.measurement import measurement_model
+from fgtrack.models.correlated_errors import split_error
+from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import CT, MotionModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch
@@ -131,9 +132,20 @@ class Entry:
     @cached_property
     def groups(self) -> list[Group]:
         """The measurements of decisions, with their whole errors, in the state of the motion model of decisions."""
-        return [
-            _group(group, self.motion, self.sensor) for group in self.candidates.groups
-        ]
+        return [own for each in self.candidates.groups for own in _groups(each, self)]
+
+    @property
+    def jump_probability(self) -> float:
+        """Probability that the correlated error of a detection is new."""
+        correlation = self.sensor.correlation
+        return 0.0 if correlation is None else correlation.jump_probability
+
+    @cached_property
+    def errors(self) -> list[int]:
+        """Indices of the time-correlated errors of the sensor in the state."""
+        first = f"{self.batch.message.sensor}."
+        names = self.motion.state_names
+        return [row for row, name in enumerate(names) if name.startswith(first)]
 
     @cached_property
     def placed(self) -> BoolArray:
@@ -166,25 +178,42 @@ class Entry:
         return any(each is not NOTHING for each in self.descriptions)
 
 
-def _group(group: Group, motion: MotionModel, sensor: SensorModel) -> Group:
-    """Return `group` with the components that decisions use."""
-    own = group.stack
+def _groups(group: Group, entry: Entry) -> Iterator[Group]:
+    """Yield the measurements of `group` with the components that decisions use.
+
+    Candidates with time-correlated errors are a group each, as in `fgtrack.tracking.preprocess`.
+    """
+    own, motion, sensor = group.stack, entry.motion, entry.sensor
     names = own.model.components
     kept = [
         row
         for row, name in enumerate(names)
         if name not in _LEFT_OUT and name not in own.assumed
     ]
-    model = measurement_model(tuple(names[row] for row in kept), motion)
-    z = np.ascontiguousarray(own.z[:, kept])
-    R = np.ascontiguousarray(group.spread[:, kept][:, :, kept])
-    stamp_error = (
+    model = measurement_model(names, motion)
+    late = (
         None
         if group.stamp_error is None
         else StampError(motion, group.stamp_error.std_s)
     )
-    stack = Measurement(own.stamp_ns, model, z, R, own.pose, own.loss)
-    return Group(group.rows, stack, R, None, stamp_error)
+    if sensor.correlation is None:
+        z, R = own.z[:, kept], group.spread[:, kept][:, :, kept]
+        stack = _measurement(own, model.part(kept), z, R)
+        yield Group(group.rows, stack, stack.R, None, late)
+        return
+    name = entry.batch.message.sensor
+    for k, whole in enumerate(group.spread):
+        split, white = split_error(name, sensor, model, whole, motion.state_names)
+        z, R = own.z[k : k + 1, kept], white[None][:, kept][:, :, kept]
+        stack = _measurement(own, split.part(kept), z, R)
+        yield Group(group.rows[k : k + 1], stack, stack.R, None, late)
+
+
+def _measurement(
+    own: Measurement, model: MeasurementModel, z: FloatArray, R: FloatArray
+) -> Measurement:
+    z, R = np.ascontiguousarray(z), np.ascontiguousarray(R)
+    return Measurement(own.stamp_ns, model, z, R, own.pose, own.loss)
 
 
 def _log_others(group: Group) -> FloatArray:

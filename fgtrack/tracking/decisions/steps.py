@@ -11,7 +11,7 @@ IEEE T-AES 54(4), 2018.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,6 +36,8 @@ _GATE_PROBABILITY = 0.99999
 _LEAST_GAIN = -LARGEST_LOSS
 _LEAST_UNSEEN = 1e-5
 NONE = -1
+_HULL_STD_MPS = 0.5
+"""Velocity of one end of a hull against the other end, when the hull turns."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,16 @@ class BirthPrior:
     per_s: float
     mean: FloatArray
     covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Second returns of a sensor."""
+
+    share: float
+    std_m: float
+    log_new_per_m2: float
+    """Logarithm of the density of new objects in a list."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,9 @@ class Rules:
     confirm_probability: float
     birth_odds: float
     min_travel_m: float
+    speed_std_mps: float
+    returns: Mapping[int, Returns]
+    """By sensor."""
     prior: BirthPrior | None = None
 
 
@@ -88,6 +103,10 @@ class Nodes:
     """Rates at which the probability of existence decays until the next list."""
     counts: IntArray
     """Numbers of detections."""
+    sensors: IntArray
+    """Numbers of the sensors that started the tracks."""
+    own: FloatArray
+    """Probability that the track is no second return of another track."""
     descriptions: tuple[Description, ...]
 
     def at(self, rows: IntArray) -> "Nodes":
@@ -104,6 +123,8 @@ class Nodes:
             self.roots.take(rows),
             self.hazards_hz.take(rows),
             self.counts.take(rows),
+            self.sensors.take(rows),
+            self.own.take(rows),
             tuple([self.descriptions[row] for row in rows.tolist()]),
         )
 
@@ -150,6 +171,8 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
         np.zeros(0, dtype=np.int64),
         np.zeros(0),
         np.zeros(0, dtype=np.int64),
+        np.zeros(0, dtype=np.int64),
+        np.zeros(0),
         (),
     )
     return Step(
@@ -176,6 +199,8 @@ class _Table:
     detectable: FloatArray
     """Probability that each track is detected, if it exists."""
     in_view: BoolArray
+    jumps: set[tuple[int, int]]
+    """Pairs whose correlated error is probably new."""
     by_node: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
 
 
@@ -186,7 +211,8 @@ def following(before: Step, entry: Entry, rules: Rules) -> Step:
     nodes = _predicted(before.nodes, dt_s, rules)
     views = rules.views.of(nodes.means[:, :2], entry.scan.ego)
     unseen = _unseen(before, dt_s, rules)
-    table = _table(nodes, entry, views[:, entry.index], unseen, rules)
+    returns = second_returns(entry, nodes, before.hypotheses[0].rows, rules)
+    table = _table(nodes, entry, views[:, entry.index], unseen, returns, rules)
     born = (table.born >= rules.least_existence).nonzero()[0].tolist()
     kept = _ranked(before, table, born, rules)
     result, hypotheses = _updated(nodes, entry, views, table, unseen, kept, rules)
@@ -207,19 +233,8 @@ def _predicted(nodes: Nodes, dt_s: float, rules: Rules) -> Nodes:
     forgotten = math.exp(-dt_s / rules.visible_s)
     visible = rules.visible_share + (nodes.visible - rules.visible_share) * forgotten
     alive = nodes.alive * np.exp(-nodes.hazards_hz * dt_s)
-    return Nodes(
-        mean,
-        covariances,
-        nodes.existed,
-        alive,
-        visible,
-        nodes.is_confirmed,
-        nodes.has_travelled,
-        nodes.first_m,
-        nodes.roots,
-        nodes.hazards_hz,
-        nodes.counts,
-        nodes.descriptions,
+    return replace(
+        nodes, means=mean, covariances=covariances, alive=alive, visible=visible
     )
 
 
@@ -252,6 +267,7 @@ def _table(
     entry: Entry,
     in_view: BoolArray,
     unseen: Sequence[tuple[float, FloatArray, FloatArray]],
+    returns: FloatArray,
     rules: Rules,
 ) -> _Table:
     """Return the log-likelihoods of a list."""
@@ -262,8 +278,8 @@ def _table(
     missed = (
         np.where(in_view, 1.0 - now * detectable, 1.0) if misses else np.ones(len(now))
     )
-    log_free, born = _free(entry, unseen, rules)
-    rows, columns, log_densities = _pairs(nodes, entry)
+    log_free, born = _free(entry, unseen, returns, rules)
+    rows, columns, log_densities, jumps = _pairs(nodes, entry)
     more = _described(nodes, entry, rows, columns)
     gains = (
         np.log(np.maximum(now * detectable, 1e-300))[rows]
@@ -282,6 +298,7 @@ def _table(
         born,
         detectable,
         in_view & misses,
+        set(zip(rows[jumps].tolist(), columns[jumps].tolist(), strict=True)),
     )
     for row, column, gain in zip(
         table.rows.tolist(), table.columns.tolist(), table.gains.tolist(), strict=True
@@ -290,20 +307,43 @@ def _table(
     return table
 
 
+def second_returns(
+    entry: Entry, nodes: Nodes, rows: IntArray, rules: Rules
+) -> FloatArray:
+    """Return the density of second returns of the tracks in `rows` at each candidate, in 1/m^2, shape (m,)."""
+    own = entry.sensor.second_returns
+    result = np.zeros(len(entry.candidates))
+    if own is None or not len(rows) or not entry.placed.any():
+        return result
+    detected = (
+        nodes.existed * nodes.alive * nodes.visible[:, entry.index]
+    )[rows] * entry.sensor.detection_probability
+    y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
+    P = nodes.covariances[rows][:, :2, :2] + own.std_m**2 * np.eye(2)
+    nis = np.einsum("mti,tij,mtj->mt", y_m, np.linalg.inv(P), y_m)
+    densities = np.exp(-0.5 * nis) / (math.tau * np.sqrt(np.linalg.det(P)))
+    return np.where(entry.placed, own.share * densities @ detected, 0.0)
+
+
 def _free(
     entry: Entry,
     unseen: Sequence[tuple[float, FloatArray, FloatArray]],
+    returns: FloatArray,
     rules: Rules,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the log-density of candidates without a track (m,), and the probability that they are objects (m,)."""
-    log_clutter = entry.log_clutter
-    may_start = entry.may_start
+    """Return the log-density of candidates without a track (m,), and the probability that they start a track (m,).
+
+    A candidate without a track is clutter, a second return of a track, or a new object.
+    """
+    clutter = np.exp(entry.log_clutter)
     if rules.prior is None:
-        new = rules.birth_odds * np.exp(entry.scores) * may_start
-        return log_clutter + np.log1p(new), new / (1.0 + new)
-    of_objects = _unseen_densities(entry, unseen) * may_start
-    total = np.exp(log_clutter) + of_objects.sum(axis=0)
-    return np.log(total), of_objects.sum(axis=0) / total
+        new = rules.birth_odds * np.exp(entry.log_clutter + entry.scores)
+    else:
+        new = _unseen_densities(entry, unseen).sum(axis=0)
+    new = np.where(entry.may_start, new, 0.0)
+    starts = np.where(entry.may_start, new + returns, 0.0)
+    total = clutter + np.maximum(starts, returns)
+    return np.log(total), starts / total
 
 
 def _unseen_densities(
@@ -343,33 +383,74 @@ def _log_densities(
     return -0.5 * (nis + logdet + y.shape[1] * math.log(math.tau))
 
 
-def _pairs(nodes: Nodes, entry: Entry) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the pairs of tracks and candidates inside the gate with their log-densities."""
+def _pairs(
+    nodes: Nodes, entry: Entry
+) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+    """Return the pairs of tracks and candidates inside the gate, their log-densities, and the pairs with a jump.
+
+    The correlated error of a pair is that of the track's last detection, or with the probability of a jump new.
+    """
     m = len(entry.candidates)
-    nothing = np.zeros(0, dtype=np.int64)
     if not m or not len(nodes.roots):
-        return nothing, nothing, np.zeros(0)
+        nothing = np.zeros(0, dtype=np.int64)
+        return nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool)
+    renewed = _renewed(nodes.means, nodes.covariances, entry)
     states = StatesAt((), nodes.means, nodes.covariances)
     reach_m = reaches_m(entry.groups, states, _GATE_PROBABILITY, 5000.0)
+    if renewed is not None:
+        reach_m = np.maximum(
+            reach_m,
+            reaches_m(entry.groups, StatesAt((), *renewed), _GATE_PROBABILITY, 5000.0),
+        )
     pairs = near(entry.candidates, nodes.means, reach_m)
     columns, rows = pairs.rows, pairs.columns
-    log_densities = np.empty(len(rows))
-    split = (
-        [(entry.groups[0], columns, np.arange(len(columns)))]
-        if len(entry.groups) == 1
-        else _split(entry.groups, columns)
+    log_densities = _pair_densities(
+        entry, rows, columns, nodes.means, nodes.covariances
     )
-    for group, members, here in split:
-        log_densities[here] = _log_densities(
-            group, members, rows.take(here), nodes.means, nodes.covariances
+    jumps = np.zeros(len(rows), dtype=bool)
+    if renewed is not None:
+        p = entry.jump_probability
+        stays = log_densities + math.log1p(-p)
+        moves = _pair_densities(entry, rows, columns, *renewed) + math.log(p)
+        log_densities, jumps = np.logaddexp(stays, moves), moves > stays
+    return rows, columns, log_densities, jumps
+
+
+def _renewed(
+    means: FloatArray, covariances: FloatArray, entry: Entry
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return states whose errors of the sensor are new; None if errors do not jump."""
+    if not (entry.jump_probability and entry.errors):
+        return None
+    x, P = means.copy(), covariances.copy()
+    x[:, entry.errors] = 0.0
+    P[:, entry.errors] = P[:, :, entry.errors] = 0.0
+    P[:, entry.errors, entry.errors] = 1.0
+    return x, P
+
+
+def _pair_densities(
+    entry: Entry,
+    rows: IntArray,
+    columns: IntArray,
+    means: FloatArray,
+    covariances: FloatArray,
+) -> FloatArray:
+    """Return the log-densities of pairs of states and candidates, shape (p,)."""
+    result = np.empty(len(rows))
+    for group, members, here in _split(entry.groups, columns):
+        result[here] = _log_densities(
+            group, members, rows.take(here), means, covariances
         )
-    return rows, columns, np.nan_to_num(log_densities, nan=-1e300)
+    return np.nan_to_num(result, nan=-1e300)
 
 
 def _split(
     groups: Sequence[Group], columns: IntArray
 ) -> list[tuple[Group, IntArray, IntArray]]:
     """Return each group with candidates of `columns`, their indices in the group, and their indices in `columns`."""
+    if len(groups) == 1:
+        return [(groups[0], columns, np.arange(len(columns)))]
     parts = []
     for group in groups:
         members = np.searchsorted(group.rows, columns)
@@ -517,7 +598,6 @@ def _updated(
     columns = np.array([column for row, column in codes if row != NONE], dtype=np.int64)
     old = _moved(nodes.at(rows), entry, rows, columns, table, views, rules)
     every = _joined(_new(entry, new, table, unseen, views.shape[1], rules), old)
-    every = _judged(every, entry, rules)
     least = rules.least_existence
     alive = every.existed * every.alive >= least
     in_use: dict[int, int] = {}
@@ -557,7 +637,8 @@ def _updated(
                 known.ended,
             )
     ranked = sorted(hypotheses.values(), key=lambda each: -each.log_weight)
-    return every.at(order), tuple(ranked)
+    result = _judged(every.at(order), ranked[0].rows, entry, rules)
+    return result, tuple(ranked)
 
 
 def _new(
@@ -576,10 +657,7 @@ def _new(
         means[k], P[k] = (
             _first_state(entry, column, unseen)
             if start is None
-            else initial_state(
-                rules.motion,
-                replace(start, position_cross={}, yaw_cross={}, speed_cross={}),
-            )
+            else initial_state(rules.motion, start)
         )
     visible = np.full((n, num_sensors), rules.visible_share)
     visible[:, entry.index] = 1.0
@@ -595,6 +673,8 @@ def _new(
         np.array([entry.roots[column] for column in columns], dtype=np.int64),
         np.zeros(n),
         np.ones(n, dtype=np.int64),
+        np.full(n, entry.index),
+        np.ones(n),
         tuple([entry.descriptions[column] for column in columns]),
     )
 
@@ -619,6 +699,14 @@ def _moved(
     ):
         own = chosen[here]
         x, covariances = means[own], P[own]
+        new = [
+            k
+            for k, one in enumerate(own.tolist())
+            if (int(rows[one]), int(columns[one])) in table.jumps
+        ]
+        renewed = _renewed(x[new], covariances[new], entry) if new else None
+        if renewed is not None:
+            x[new], covariances[new] = renewed
         _correct(group, members, x, covariances)
         means[own], P[own] = x, covariances
     detectable = table.detectable[rows]
@@ -647,19 +735,16 @@ def _moved(
     travelled = nodes.has_travelled | (
         hit & (np.hypot(*(means[:, :2] - nodes.first_m).T) >= rules.min_travel_m)
     )
-    return Nodes(
-        means,
-        P,
-        existed,
-        alive,
-        visible,
-        nodes.is_confirmed,
-        travelled,
-        nodes.first_m,
-        nodes.roots,
-        nodes.hazards_hz,
-        nodes.counts + hit,
-        tuple(descriptions),
+    return replace(
+        nodes,
+        means=means,
+        covariances=P,
+        existed=existed,
+        alive=alive,
+        visible=visible,
+        has_travelled=travelled,
+        counts=nodes.counts + hit,
+        descriptions=tuple(descriptions),
     )
 
 
@@ -676,9 +761,13 @@ def _joined(first: Nodes, second: Nodes) -> Nodes:
     return Nodes(**joined, descriptions=first.descriptions + second.descriptions)
 
 
-def _judged(nodes: Nodes, entry: Entry, rules: Rules) -> Nodes:
-    """Return the tracks with their confirmation, and with the rate at which their existence decays from now on."""
-    exists = nodes.existed * nodes.alive
+def _judged(nodes: Nodes, rows: IntArray, entry: Entry, rules: Rules) -> Nodes:
+    """Return the tracks with their confirmation, and with the rate at which their existence decays from now on.
+
+    `rows` are the tracks of the best hypothesis, of which other tracks may be second returns.
+    """
+    own = _own(nodes, rows, rules)
+    exists = nodes.existed * nodes.alive * own
     confirmed = nodes.is_confirmed | (
         nodes.has_travelled & (exists >= rules.confirm_probability)
     )
@@ -690,17 +779,54 @@ def _judged(nodes: Nodes, entry: Entry, rules: Rules) -> Nodes:
         1.0 / rules.lifetime_s + (1.0 - seen) / rules.hidden_s,
         1.0 / rules.lifetime_s + 1.0 / rules.out_of_view_s,
     )
-    return Nodes(
-        nodes.means,
-        nodes.covariances,
-        nodes.existed,
-        nodes.alive,
-        nodes.visible,
-        confirmed,
-        nodes.has_travelled,
-        nodes.first_m,
-        nodes.roots,
-        hazards_hz,
-        nodes.counts,
-        nodes.descriptions,
-    )
+    return replace(nodes, is_confirmed=confirmed, hazards_hz=hazards_hz, own=own)
+
+
+def _own(nodes: Nodes, rows: IntArray, rules: Rules) -> FloatArray:
+    """Return the probability that each track is an object of its own, shape (n,), and no second return of a track in
+    `rows`.
+
+    The second return keeps its place on the hull: the distance of both tracks is normal with the standard deviation
+    of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
+    velocity of its own. A track with fewer detections may be a second return of a track with more detections.
+    """
+    own = np.ones(len(nodes.roots))
+    if not rules.returns or len(rows) < 2:
+        return own
+    position, velocity = slice(0, 2), slice(2, 4)
+    exists = nodes.existed * nodes.alive
+    speeds_m2ps2 = 2.0 * rules.speed_std_mps**2 * np.eye(2)
+    slow_m2ps2 = _HULL_STD_MPS**2 * np.eye(2)
+    for k in range(len(own)):
+        given = rules.returns.get(int(nodes.sensors[k]))
+        if given is None:
+            continue
+        hosts = rows[
+            (nodes.counts[rows] > nodes.counts[k])
+            & (
+                np.hypot(*(nodes.means[rows, :2] - nodes.means[k, :2]).T)
+                < 6.0 * given.std_m
+            )
+        ]
+        if not len(hosts):
+            continue
+        x = nodes.means[hosts] - nodes.means[k]
+        P = nodes.covariances[hosts] + nodes.covariances[k]
+        size_m2 = given.std_m**2 * np.eye(2)
+        log_return = (
+            np.log(given.share * exists[hosts])
+            + _log_normal(x[:, position], P[:, position, position] + size_m2)
+            + _log_normal(x[:, velocity], P[:, velocity, velocity] + slow_m2ps2)
+        )
+        log_object = given.log_new_per_m2 + _log_normal(
+            x[:, velocity], P[:, velocity, velocity] + speeds_m2ps2
+        )
+        odds = np.exp(np.clip(log_return - log_object, -50.0, 50.0)).sum()
+        own[k] = 1.0 / (1.0 + odds)
+    return own
+
+
+def _log_normal(x: FloatArray, P: FloatArray) -> FloatArray:
+    """Return log N(x; 0, P) of vectors (m, 2) with covariances (m, 2, 2), shape (m,)."""
+    nis = np.einsum("mi,mij,mj->m", x, np.linalg.inv(P), x)
+    return np.asarray(-0.5 * (nis + np.log(np.linalg.det(P))) - math.log(math.tau))
