@@ -137,6 +137,7 @@ def _decision_rules(config: Config) -> Rules:
             sensor.second_returns.share,
             sensor.second_returns.std_m,
             math.log(odds * sensor.clutter_per_m2),
+            sensor.detection_probability * own.visible_share,
         )
         for index, sensor in enumerate(config.sensors.values())
         if sensor.second_returns is not None

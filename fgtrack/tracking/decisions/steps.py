@@ -57,6 +57,23 @@ class Returns:
     std_m: float
     log_new_per_m2: float
     """Logarithm of the density of new objects in a list."""
+    detection_probability: float
+
+    def log_seen(self, hits: int, misses: int) -> float:
+        """Return the log-likelihood ratio of an object against second returns, of detections in `hits` lists.
+
+        An object is detected with its probability. Each hull has a share of second returns of its own, which has a
+        beta distribution of the strength of two lists.
+        """
+        a, b = 2.0 * self.share, 2.0 * (1.0 - self.share)
+        own = hits * math.log(self.detection_probability) + misses * math.log1p(
+            -self.detection_probability
+        )
+        return own - _log_beta(a + hits, b + misses) + _log_beta(a, b)
+
+
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 @dataclass(frozen=True)
@@ -102,7 +119,9 @@ class Nodes:
     hazards_hz: FloatArray
     """Rates at which the probability of existence decays until the next list."""
     counts: IntArray
-    """Numbers of detections."""
+    """Numbers of detections by `sensors`."""
+    misses: IntArray
+    """Numbers of lists of `sensors` in whose view the object was, without a detection."""
     sensors: IntArray
     """Numbers of the sensors that started the tracks."""
     own: FloatArray
@@ -123,6 +142,7 @@ class Nodes:
             self.roots.take(rows),
             self.hazards_hz.take(rows),
             self.counts.take(rows),
+            self.misses.take(rows),
             self.sensors.take(rows),
             self.own.take(rows),
             tuple([self.descriptions[row] for row in rows.tolist()]),
@@ -170,6 +190,7 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
         np.zeros((0, 2)),
         np.zeros(0, dtype=np.int64),
         np.zeros(0),
+        np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
         np.zeros(0),
@@ -673,6 +694,7 @@ def _new(
         np.array([entry.roots[column] for column in columns], dtype=np.int64),
         np.zeros(n),
         np.ones(n, dtype=np.int64),
+        np.zeros(n, dtype=np.int64),
         np.full(n, entry.index),
         np.ones(n),
         tuple([entry.descriptions[column] for column in columns]),
@@ -732,6 +754,7 @@ def _moved(
             descriptions[k] = descriptions[k].learned(
                 entry.descriptions[int(columns[k])]
             )
+    of_sensor = nodes.sensors == entry.index
     travelled = nodes.has_travelled | (
         hit & (np.hypot(*(means[:, :2] - nodes.first_m).T) >= rules.min_travel_m)
     )
@@ -743,7 +766,8 @@ def _moved(
         alive=alive,
         visible=visible,
         has_travelled=travelled,
-        counts=nodes.counts + hit,
+        counts=nodes.counts + (hit & of_sensor),
+        misses=nodes.misses + (~hit & of_sensor & table.in_view[rows]),
         descriptions=tuple(descriptions),
     )
 
@@ -820,6 +844,9 @@ def _own(nodes: Nodes, rows: IntArray, rules: Rules) -> FloatArray:
         )
         log_object = given.log_new_per_m2 + _log_normal(
             x[:, velocity], P[:, velocity, velocity] + speeds_m2ps2
+        )
+        log_object = log_object + given.log_seen(
+            int(nodes.counts[k]), int(nodes.misses[k])
         )
         odds = np.exp(np.clip(log_return - log_object, -50.0, 50.0)).sum()
         own[k] = 1.0 / (1.0 + odds)
