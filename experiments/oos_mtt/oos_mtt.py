@@ -16,6 +16,8 @@ import numpy as np
 import typer
 from hypotheses import trajectories
 from scenes import (
+    APPEARANCES_PER_S,
+    BIRTH_MEAN,
     BIRTH_STD,
     CLUTTER_PER_M2,
     DEATHS_PER_S,
@@ -38,7 +40,7 @@ LONGEST_S = 60.0
 """Window of the estimators. The latest scans are some 10 s late."""
 REFERENCE = "hypotheses"
 NUM_HYPOTHESES = 10
-USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window")
+CARTESIAN = ("x_m", "y_m", "vx_mps", "vy_mps")
 #: Estimator and order of the scans, by label.
 METHODS: Mapping[str, tuple[str, bool]] = {
     "drop": ("drop", False),
@@ -68,10 +70,14 @@ def configuration(estimator: str) -> Config:
                 "kind": "cv",
                 "std_per_s": {"velocity": 10.0 * DENSITY_M2PS3**0.5},
             },
+            "association": {"kind": "hypotheses", "most": NUM_HYPOTHESES},
             "birth": {
-                "speed_std_mps": float(BIRTH_STD[2]) * 2.0**0.5,
+                "appearances_per_s": APPEARANCES_PER_S,
+                "mean": dict(zip(CARTESIAN, BIRTH_MEAN.tolist(), strict=True)),
+                "std": dict(zip(CARTESIAN, BIRTH_STD.tolist(), strict=True)),
             },
             "lifecycle": {
+                "delete_probability": 1e-4,
                 "lifetime_s": 1.0 / DEATHS_PER_S,
                 "visible_share": 0.99,
                 "out_of_view_s": LONGEST_S,
@@ -85,14 +91,12 @@ def configuration(estimator: str) -> Config:
 
 
 def final_trajectories(scene: Scene, run: Run) -> list[Trajectory]:
-    """Return the final trajectory of each track that was ever confirmed, from its first to its last detection."""
-    tracks = run.tracks
-    confirmed = set(tracks["track_id"][tracks["status"] != "tentative"])
-    updates = run.updates[run.updates["disposition"].isin(USED)]
-    smoothed = run.smoothed
+    """Return the final trajectory of each track that probably existed, from its first to its last detection."""
+    tracks, smoothed, ended = run.tracks, run.smoothed, run.final_tracks
     found = []
-    for track_id in sorted(confirmed):
-        own = updates[updates["track_id"] == track_id]["stamp_ns"]
+    for track_id, first_ns, last_ns in ended[ended["probability"] > 0.5][
+        ["track_id", "first_stamp_ns", "last_stamp_ns"]
+    ].itertuples(index=False):
         final = smoothed[
             (smoothed["track_id"] == track_id) & (smoothed["kind"] == "final")
         ]
@@ -103,7 +107,8 @@ def final_trajectories(scene: Scene, run: Run) -> list[Trajectory]:
                 ["stamp_ns", "x_m", "y_m", "speed_mps", "yaw_rad"]
             ].itertuples(index=False)
         }
-        found.append(_at_times(scene, known, int(own.min()), int(own.max())))
+        if known:
+            found.append(_at_times(scene, known, int(first_ns), int(last_ns)))
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import takewhile
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -273,6 +273,35 @@ class UpdateRecord:
     """Setting by which the detection is out of bounds; None for every other disposition."""
     yaw: YawWord | None = None
     """`flipped` if the measured yaw was turned by half a turn, `unused` if the innovation lacks it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """A decision about a received detection that late data has changed: one row of revisions.csv."""
+
+    tick: int
+    """Tick at which the decision has changed."""
+    sensor: str
+    stamp_ns: int
+    receipt_ns: int
+    index: int
+    old_track_id: int | None
+    """Track before; None for a detection without a track."""
+    track_id: int | None
+    """Track from now on; None for a detection without a track."""
+
+
+class FinalTrack(NamedTuple):
+    """What a track was in the end: one row of final_tracks.csv."""
+
+    track_id: int
+    first_stamp_ns: int
+    """Stamp of the first detection."""
+    last_stamp_ns: int
+    """Stamp of the last detection."""
+    is_confirmed: bool
+    probability: float
+    """Probability that the object of the track has ever existed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -194,6 +194,7 @@ def _drive(
         )
         detections_received += num_detections
         writer.write_tick(report, process_ns, num_detections)
+        writer.write_decisions(tracker.revised())
         on_tick(report)
     if feed.last_receipt_ns is None:
         raise DataError(
@@ -202,6 +203,7 @@ def _drive(
             )
         )
     writer.write_smoothed(tracker.finish())
+    writer.write_decisions(tracker.revised(), tracker.final_tracks())
     meta = {
         "wall_s": (perf_counter_ns() - started_ns) / NS_PER_S,
         "messages_received": feed.num_messages,

@@ -78,6 +78,14 @@ class Run:
     )
     smoothed = _frame("smoothed", "Final states, and the lagged states of one lag.")
     lagged = _frame("lagged", "Lagged states of every lag.")
+    revisions = _frame(
+        "revisions",
+        "A row for each decision about a detection that late data has changed.",
+    )
+    final_tracks = _frame(
+        "final_tracks",
+        "What each track was in the end, if late data changes decisions.",
+    )
     timing = _frame(
         "timing",
         "A row for each tick: its time, processing time, numbers of tracks and detections.",

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict, deque
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, astuple, dataclass, field
 from time import monotonic
 
@@ -10,14 +10,16 @@ from fgtrack.core.types import (
     DetectionList,
     Disposition,
     EgoState,
+    FinalTrack,
     ObjectReport,
+    Revision,
     SmoothedReport,
     TickReport,
     TruthState,
 )
 from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.runs.rows import Row, detection_rows, rows, smoothed_rows, state_cells
-from fgtrack.runs.schema import COLUMNS, RUN_FORMAT
+from fgtrack.runs.schema import COLUMNS, NO_TRACK, RUN_FORMAT
 
 #: Number of the first columns of `detections` that name a detection: sensor, stamp, receipt and index.
 _KEY = 4
@@ -122,6 +124,26 @@ class RunSink(ABC):
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
         """Add rows to the table `smoothed`; there may be none."""
         self._rows["smoothed"] += smoothed_rows(reports)
+
+    def write_decisions(
+        self, revisions: Iterable[Revision], tracks: Iterable[FinalTrack] = ()
+    ) -> None:
+        """Add rows to the tables `revisions` and `final_tracks`; there may be none."""
+        self._rows["revisions"] += [
+            (
+                each.tick,
+                each.sensor,
+                each.stamp_ns,
+                each.receipt_ns,
+                each.index,
+                NO_TRACK if each.old_track_id is None else each.old_track_id,
+                NO_TRACK if each.track_id is None else each.track_id,
+            )
+            for each in revisions
+        ]
+        self._rows["final_tracks"] += [
+            (*each[:3], int(each.is_confirmed), each.probability) for each in tracks
+        ]
 
     def write_truth(self, truth: TruthState) -> None:
         """Add a row to the table `truth`, or for an ignored object to `ignored`."""

@@ -7,14 +7,20 @@ from typing import ClassVar, cast
 
 import numpy as np
 
-from fgtrack.core.types import Disposition, EgoState, UpdateRecord
+from fgtrack.core.types import (
+    Disposition,
+    EgoState,
+    FinalTrack,
+    Revision,
+    UpdateRecord,
+)
 from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
 from fgtrack.tracking.decisions.entries import Entry
-from fgtrack.tracking.decisions.history import Decisions, Explained
+from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
-from fgtrack.tracking.decisions.steps import NONE
+from fgtrack.tracking.decisions.steps import NONE, Ended
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.inbox import record
 from fgtrack.tracking.lives.counters import Scan
@@ -40,7 +46,11 @@ class DecidedTracker(MultiObjectTracker):
         "_roots",
         "_next_public",
         "_next_rebuilt",
-        "revisions",
+        "_revisions",
+        "_final",
+        "_ended",
+        "_of",
+        "num_revisions",
     )
 
     def __init__(self, parts: TrackerParts, decisions: Decisions) -> None:
@@ -53,8 +63,35 @@ class DecidedTracker(MultiObjectTracker):
         """Root of each public number."""
         self._next_public = 0
         self._next_rebuilt = _FIRST_REBUILT
-        self.revisions = 0
-        """Number of detections whose track was changed later."""
+        self._of: dict[int, list[int | None]] = {}
+        """Published track of each candidate, by the number of its list; None without a track."""
+        self.num_revisions = 0
+        """Number of changes of a detection's track by late data."""
+        self._revisions: list[Revision] = []
+        self._final: dict[int, tuple[int, int]] = {}
+        """First and last stamps of the detections of each track, by root."""
+        self._ended: list[Ended] = []
+
+    def revised(self) -> list[Revision]:
+        """See `MultiObjectTracker.revised`."""
+        found, self._revisions = self._revisions, []
+        return found
+
+    def final_tracks(self) -> list[FinalTrack]:
+        """See `MultiObjectTracker.final_tracks`. The tracks are in the order of their numbers."""
+        final, ended = dict(self._final), list(self._ended)
+        _settle(self.decisions.finished(), final, ended)
+        found = [
+            FinalTrack(
+                self._public[each.root],
+                *final[each.root],
+                each.is_confirmed,
+                each.probability,
+            )
+            for each in ended
+            if each.root in self._public and each.root in final
+        ]
+        return sorted(found)
 
     def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
         """Decide about one list, and fuse its detections."""
@@ -78,12 +115,17 @@ class DecidedTracker(MultiObjectTracker):
             self._records += candidates.records(batch, every, Disposition.TOO_OLD)
             return
         entry = self._entry(posed, candidates, scan)
-        self._follow(entry, self.decisions.add(entry))
+        changes = self.decisions.add(entry)
+        self._of[entry.number] = [None] * len(candidates)
+        self._follow(entry, changes)
 
     def _forget(self) -> None:
         """Decide for good about lists that no late list can precede."""
         oldest_ns = self._parts.bank.window_start_ns
-        self.decisions.forget(oldest_ns)
+        settled = self.decisions.forget(oldest_ns)
+        for each in settled:
+            del self._of[each.entry.number]
+        _settle(settled, self._final, self._ended)
         self._tracks.end(self._lives.ended_before(oldest_ns))
 
     def _entry(self, posed: PosedBatch, candidates: Candidates, scan: Scan) -> Entry:
@@ -141,7 +183,7 @@ class DecidedTracker(MultiObjectTracker):
         """Return the public track of each candidate of the changed lists. New tracks get numbers."""
         unknown: dict[int, Counter[int]] = {}
         for each in changes:
-            for root, old in zip(each.taken, each.entry.published, strict=True):
+            for root, old in zip(each.taken, self._of[each.entry.number], strict=True):
                 if root != NONE and root not in self._public:
                     votes = unknown.setdefault(root, Counter())
                     if old is not None:
@@ -177,7 +219,7 @@ class DecidedTracker(MultiObjectTracker):
             if id(entry) not in changed:
                 present.update(
                     self._roots[public]
-                    for public in entry.published
+                    for public in self._of[entry.number]
                     if public is not None and public in self._roots
                 )
         nodes = self.decisions.nodes
@@ -195,14 +237,14 @@ class DecidedTracker(MultiObjectTracker):
         again: set[int] = set()
         added: list[tuple[Entry, list[int]]] = []
         for each, own in zip(changes, named, strict=True):
-            before = each.entry.published
+            before = self._of[each.entry.number]
             is_new = each.entry is entry
             new_positions = []
             for position, (public, old) in enumerate(zip(own, before, strict=True)):
                 if public == old:
                     continue
                 if not is_new:
-                    self.revisions += 1
+                    self._note(each.entry, position, old, public)
                 if old is not None:
                     again.add(old)
                 if public is not None:
@@ -210,18 +252,18 @@ class DecidedTracker(MultiObjectTracker):
                     if is_birth and not (is_new and self._is_unknown(public)):
                         again.add(public)
                     new_positions.append(position)
-            each.entry.published = own
+            self._of[each.entry.number] = own
             if new_positions:
                 added.append((each.entry, new_positions))
         self._results: dict[int, UpdateRecord] = {}
         for public in sorted(again):
             self._rebuild(public, entry)
         for each_entry, positions in added:
-            rest = [p for p in positions if each_entry.published[p] not in again]
+            rest = [p for p in positions if self._of[each_entry.number][p] not in again]
             births = [
                 p
                 for p in rest
-                if self._roots[cast(int, each_entry.published[p])]
+                if self._roots[cast(int, self._of[each_entry.number][p])]
                 == each_entry.roots[p]
             ]
             self._fuse(
@@ -229,6 +271,26 @@ class DecidedTracker(MultiObjectTracker):
             )
             for position in births:
                 self._birth(each_entry, position)
+
+    def _note(
+        self, entry: Entry, position: int, old: int | None, public: int | None
+    ) -> None:
+        """Note that a detection has another track than before."""
+        self.num_revisions += 1
+        message, leader = entry.batch.message, entry.candidates.leaders[position]
+        stamp_ns = message.objects[leader].stamp_ns
+        self._revisions += [
+            Revision(
+                self._tick,
+                message.sensor,
+                message.stamp_ns if stamp_ns is None else stamp_ns,
+                message.receipt_ns,
+                index,
+                old,
+                public,
+            )
+            for index in (leader, *entry.candidates.merged.get(leader, ()))
+        ]
 
     def _is_unknown(self, public: int) -> bool:
         """True for a track that no estimator holds."""
@@ -244,7 +306,7 @@ class DecidedTracker(MultiObjectTracker):
         dets = [
             (entry, position)
             for entry in self.decisions.entries
-            for position, each in enumerate(entry.published)
+            for position, each in enumerate(self._of[entry.number])
             if each == public
         ]
         if dets and dets[0][0].roots[dets[0][1]] != root and bank_id is not None:
@@ -262,7 +324,7 @@ class DecidedTracker(MultiObjectTracker):
 
     def _birth(self, entry: Entry, position: int, is_again: bool = False) -> None:
         """Start the estimator of a track."""
-        public = cast(int, entry.published[position])
+        public = cast(int, self._of[entry.number][position])
         start = entry.start(position)
         if start is None:
             return
@@ -293,7 +355,7 @@ class DecidedTracker(MultiObjectTracker):
         """Fuse candidates of a list with their tracks."""
         chosen: list[tuple[int, int]] = []
         for position in positions:
-            bank_id = self._tracks.bank_id(cast(int, entry.published[position]))
+            bank_id = self._tracks.bank_id(cast(int, self._of[entry.number][position]))
             if bank_id is not None:
                 chosen.append((position, bank_id))
         if not chosen:
@@ -358,12 +420,12 @@ class DecidedTracker(MultiObjectTracker):
                 continue
             if self._tracks.bank_id(public) is None:
                 self._rebuild(public)
-            bank_id = self._tracks.bank_id(public)
-            if bank_id is None:
+            held = self._tracks.bank_id(public)
+            if held is None:
                 continue
-            living.add(bank_id)
+            living.add(held)
             self._lives.live(
-                bank_id,
+                held,
                 Life(
                     float(nodes.existed[row] * nodes.alive[row] * nodes.own[row]),
                     step.stamp_ns,
@@ -373,22 +435,25 @@ class DecidedTracker(MultiObjectTracker):
                 ),
             )
         roots = {root for entry in self.decisions.entries for root in entry.roots}
-        for each in self._parts.bank.track_ids:
-            if each in living or self._lives.is_suspended(each):
+        for bank_id in self._parts.bank.track_ids:
+            if bank_id in living or self._lives.is_suspended(bank_id):
                 continue
-            life = self._lives.lives.get(each)
+            life = self._lives.lives.get(bank_id)
             was_confirmed = life is not None and life.is_confirmed
-            root = self._roots.get(self._tracks.public(each))
-            if root in roots and not was_confirmed:
-                self._tracks.drop(each)
+            begun = self._roots.get(self._tracks.public(bank_id))
+            if begun in roots and not was_confirmed:
+                self._tracks.drop(bank_id)
             else:
-                self._lives.suspend(each, step.stamp_ns)
+                self._lives.suspend(bank_id, step.stamp_ns)
 
     def _record(self, entry: Entry) -> None:
         """Record what has become of the detections of a list."""
         batch, candidates = entry.batch, entry.candidates
-        for position, public in enumerate(entry.published):
+        for position, public in enumerate(self._of[entry.number]):
             leader = candidates.leaders[position]
+            is_birth = public is not None and (
+                self._roots.get(public) == entry.roots[position]
+            )
             if public is None:
                 self._records += candidates.records(
                     batch, [position], Disposition.GATED
@@ -412,8 +477,22 @@ class DecidedTracker(MultiObjectTracker):
                 )
                 self._records.append((own, *others[0][1:]))
                 continue
-            is_birth = self._roots.get(public) == entry.roots[position]
             disposition = Disposition.BIRTH if is_birth else Disposition.FAILED
             self._records += candidates.records(
                 batch, [position], disposition, public if is_birth else None
             )
+
+
+def _settle(
+    settled: Sequence[Settled],
+    final: dict[int, tuple[int, int]],
+    ended: list[Ended],
+) -> None:
+    """Add decisions to the first and last stamps of tracks, and to the ended tracks."""
+    for each in settled:
+        stamp_ns = each.entry.batch.stamp_ns
+        for root in each.taken:
+            if root != NONE:
+                first_ns, _ = final.get(root, (stamp_ns, stamp_ns))
+                final[root] = first_ns, stamp_ns
+        ended += each.ended

@@ -17,7 +17,9 @@ from fgtrack.core.types import (
     DetectionList,
     Disposition,
     EgoState,
+    FinalTrack,
     FloatArray,
+    Revision,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -28,6 +30,7 @@ from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.object_bank import ahead_of, states_of
 from fgtrack.models.measurement import AT_ORIGIN
 from fgtrack.tracking.association import Assignment
+from fgtrack.tracking.decisions.lives import DecidedLives
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego.trajectory import EgoPose
 from fgtrack.tracking.ego.waiting import places, range_of
@@ -229,13 +232,21 @@ class MultiObjectTracker:
         self._tracks.end(self._parts.bank.track_ids)
         return tuple(self._publication.smoothed())
 
+    def revised(self) -> list[Revision]:
+        """Return the decisions that late data has changed since the last call. This tracker decides once."""
+        return []
+
+    def final_tracks(self) -> list[FinalTrack]:
+        """Return what each track was in the end; empty for a tracker that decides once."""
+        return []
+
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """Return the report of a track at any stamp in or after its window.
 
         The state is smoothed or filtered in the past, and predicted in the future. Raises `CallError` for a track that
         does not exist, for a stamp before its window, and for a state that is not finite.
         """
-        self._check_exists(track_id)
+        track_id = self._checked_id(track_id)
         bank, motion = self._parts.bank, self._parts.motion
         known = bank.state_of(track_id, min(stamp_ns, bank.present_ns))
         states = ahead_of(known, bank.present_ns, motion, stamp_ns)
@@ -251,11 +262,14 @@ class MultiObjectTracker:
 
         Raises `CallError` for a track that does not exist, and for an estimator that is not a smoother.
         """
-        self._check_exists(track_id)
-        return self._parts.bank.window(track_id)
+        return self._parts.bank.window(self._checked_id(track_id))
 
-    def _check_exists(self, track_id: int) -> None:
-        """Raise `CallError` for a track that does not exist, or is suspended."""
+    def _checked_id(self, track_id: int) -> int:
+        """Return the number of a track in the bank. Raises `CallError` for a track that does not exist, or is
+        suspended.
+        """
+        found = self._tracks.bank_id(track_id)
+        track_id = track_id if found is None else found
         suspended = self._parts.lifecycle.suspended()
         track_ids = [
             each for each in self._parts.bank.track_ids if each not in suspended
@@ -264,6 +278,7 @@ class MultiObjectTracker:
             raise CallError(
                 f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}"
             )
+        return track_id
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """Return the reports of all tracks that have a state at a stamp, in order of birth, see `state_at`."""
@@ -497,5 +512,7 @@ class MultiObjectTracker:
             missed = [states.track_ids[track] for track in rows]
             positions_m = states.means[rows, :2]
             ranges_m = self._ranges_m(missed, positions_m, scan.ego)
-            ended = self._parts.lifecycle.missed(scan, missed, positions_m, ranges_m)
-            self._tracks.end(ended)
+            lives = self._parts.lifecycle
+            if not isinstance(lives, DecidedLives):
+                ended = lives.missed(scan, missed, positions_m, ranges_m)
+                self._tracks.end(ended)

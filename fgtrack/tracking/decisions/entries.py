@@ -109,8 +109,8 @@ class Entry:
     """Returns the first state of the track that a candidate would start; None without one."""
     roots: list[int] = field(default_factory=list)
     """Numbers of the tracks that the candidates would start."""
-    published: list[int | None] = field(default_factory=list)
-    """Track of each candidate in the published decisions; None without one."""
+    number: int = 0
+    """Number of the list in the order of arrival."""
 
     _starts: dict[int, Start | None] = field(default_factory=dict)
 

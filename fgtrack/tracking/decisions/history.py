@@ -10,11 +10,13 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.steps import (
     NONE,
+    Ended,
     Nodes,
     Rules,
     Step,
     first_step,
     following,
+    living,
 )
 
 
@@ -27,13 +29,30 @@ class Explained:
     """Track of each candidate, by root; `NONE` for clutter."""
 
 
+@dataclass(frozen=True)
+class Settled:
+    """Decisions about a list."""
+
+    entry: Entry
+    taken: tuple[int, ...]
+    """Track of each candidate, by root; `NONE` for clutter."""
+    ended: tuple[Ended, ...]
+    """Tracks that end with the list."""
+
+
 class Decisions(Stateful):
     """Keeps the hypotheses after each list, and decides again from the stamp of a late list on.
 
     A step is never changed, so the step before a late list is its checkpoint.
     """
 
-    STATE: ClassVar[tuple[str, ...]] = ("_steps", "_first", "_published", "_next_root")
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_steps",
+        "_first",
+        "_published",
+        "_next_root",
+        "_next_list",
+    )
 
     def __init__(self, rules: Rules, num_sensors: int) -> None:
         self._rules, self._num_sensors = rules, num_sensors
@@ -42,7 +61,7 @@ class Decisions(Stateful):
         """Step before the first one that is kept."""
         self._published: list[int] = []
         """Hypothesis of each step that is published."""
-        self._next_root = 0
+        self._next_root = self._next_list = 0
 
     @property
     def motion(self) -> MotionModel:
@@ -77,7 +96,7 @@ class Decisions(Stateful):
         """
         count = len(entry.candidates)
         entry.roots = list(range(self._next_root, self._next_root + count))
-        entry.published = [None] * count
+        entry.number, self._next_list = self._next_list, self._next_list + 1
         self._next_root += count
         if self._first is None:
             self._first = first_step(
@@ -110,12 +129,31 @@ class Decisions(Stateful):
                 yield Explained(step.entry, own.taken)
             hypothesis = own.parent
 
-    def forget(self, oldest_ns: int) -> list[Entry]:
-        """Decide for good about the lists before `oldest_ns`; return them."""
+    def forget(self, oldest_ns: int) -> list[Settled]:
+        """Decide for good about the lists before `oldest_ns`; return the decisions, the oldest one first."""
         count = bisect_left(self._steps, oldest_ns, key=lambda step: step.stamp_ns)
         if not count:
             return []
-        gone = self._steps[:count]
-        self._first = gone[-1]
+        settled = self._settled(count)
+        self._first = self._steps[count - 1]
         del self._steps[:count], self._published[:count]
-        return [step.entry for step in gone if step.entry is not None]
+        return settled
+
+    def _settled(self, count: int) -> list[Settled]:
+        """Return the published decisions about the first `count` lists."""
+        published = zip(self._steps[:count], self._published[:count], strict=True)
+        return [
+            Settled(step.entry, own.taken, own.ended)
+            for step, number in published
+            if step.entry is not None
+            for own in [step.hypotheses[number]]
+        ]
+
+    def finished(self) -> list[Settled]:
+        """Return the decisions about all lists that are not decided for good. The tracks end with the last one."""
+        settled = self._settled(len(self._steps))
+        if self._steps:
+            last = settled[-1]
+            ended = (*last.ended, *living(self._steps[-1]))
+            settled[-1] = Settled(last.entry, last.taken, ended)
+        return settled

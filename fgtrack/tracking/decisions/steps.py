@@ -13,6 +13,7 @@ IEEE T-AES 54(4), 2018.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -149,6 +150,15 @@ class Nodes:
         )
 
 
+class Ended(NamedTuple):
+    """A track that has ended."""
+
+    root: int
+    probability: float
+    """Probability that the object has ever existed."""
+    is_confirmed: bool
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """One explanation of all detections up to a list."""
@@ -160,8 +170,8 @@ class Hypothesis:
     """Track of each candidate of the list, by root; `NONE` for clutter."""
     parent: int
     """Index of the hypothesis of the step before."""
-    ended: tuple[int, ...] = ()
-    """Roots of the tracks that end with this list."""
+    ended: tuple[Ended, ...] = ()
+    """Tracks that end with this list."""
 
 
 @dataclass(frozen=True)
@@ -336,14 +346,14 @@ def second_returns(
     result = np.zeros(len(entry.candidates))
     if own is None or not len(rows) or not entry.placed.any():
         return result
-    detected = (
-        nodes.existed * nodes.alive * nodes.visible[:, entry.index]
-    )[rows] * entry.sensor.detection_probability
+    detected = (nodes.existed * nodes.alive * nodes.visible[:, entry.index])[
+        rows
+    ] * entry.sensor.detection_probability
     y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
     P = nodes.covariances[rows][:, :2, :2] + own.std_m**2 * np.eye(2)
     nis = np.einsum("mti,tij,mtj->mt", y_m, np.linalg.inv(P), y_m)
     densities = np.exp(-0.5 * nis) / (math.tau * np.sqrt(np.linalg.det(P)))
-    return np.where(entry.placed, own.share * densities @ detected, 0.0)
+    return np.asarray(np.where(entry.placed, own.share * densities @ detected, 0.0))
 
 
 def _free(
@@ -401,7 +411,7 @@ def _log_densities(
     _, nis, logdet = kernels(_KALMAN).innovations(
         y, stacked(H), np.ascontiguousarray(covariances), of, R, every
     )
-    return -0.5 * (nis + logdet + y.shape[1] * math.log(math.tau))
+    return np.asarray(-0.5 * (nis + logdet + y.shape[1] * math.log(math.tau)))
 
 
 def _pairs(
@@ -631,7 +641,7 @@ def _updated(
         for k, (_, column) in zip(own, each.nodes, strict=True):
             if column != NONE:
                 taken[column] = roots[k]
-        ended = tuple([roots[k] for k in own if not alive[k]])
+        ended = tuple([_ended(every, k) for k in own if not alive[k]])
         for k in living:
             in_use.setdefault(k, len(in_use))
         drafts.append((each, living, tuple(taken), ended))
@@ -660,6 +670,17 @@ def _updated(
     ranked = sorted(hypotheses.values(), key=lambda each: -each.log_weight)
     result = _judged(every.at(order), ranked[0].rows, entry, rules)
     return result, tuple(ranked)
+
+
+def _ended(nodes: Nodes, row: int) -> Ended:
+    """Return a track as one that ends."""
+    probability = float(nodes.existed[row] * nodes.own[row])
+    return Ended(int(nodes.roots[row]), probability, bool(nodes.is_confirmed[row]))
+
+
+def living(step: Step) -> list[Ended]:
+    """Return the tracks of the best hypothesis as if they ended now."""
+    return [_ended(step.nodes, row) for row in step.hypotheses[0].rows.tolist()]
 
 
 def _new(
