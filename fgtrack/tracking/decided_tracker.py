@@ -249,7 +249,7 @@ class DecidedTracker(MultiObjectTracker):
                     again.add(old)
                 if public is not None:
                     is_birth = each.taken[position] == each.entry.roots[position]
-                    if is_birth and not (is_new and self._is_unknown(public)):
+                    if self._is_unknown(public) != (is_birth and is_new):
                         again.add(public)
                     new_positions.append(position)
             self._of[each.entry.number] = own

@@ -1,0 +1,64 @@
+"""Ranked assignments equal those of a search over all assignments."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from fgtrack.tracking.decisions.ranking import LARGEST_LOSS, best_assignments
+
+
+def every_assignment(
+    pairs: list[tuple[int, int, float]],
+) -> list[tuple[float, frozenset[tuple[int, int]]]]:
+    """Return gain and pairs of all assignments, the best one first."""
+    tracks = sorted({track for track, _, _ in pairs})
+    options = [
+        [(None, 0.0), *((j, gain) for i, j, gain in pairs if i == track)]
+        for track in tracks
+    ]
+    found = []
+    for chosen in product(*options):
+        used = [candidate for candidate, _ in chosen if candidate is not None]
+        if len(used) == len(set(used)):
+            taken = frozenset(
+                (track, candidate)
+                for track, (candidate, _) in zip(tracks, chosen, strict=True)
+                if candidate is not None
+            )
+            found.append((sum(gain for _, gain in chosen), taken))
+    return sorted(found, key=lambda each: -each[0])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_best_assignments_are_those_of_a_search(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pairs = [
+        (track, candidate, float(rng.normal(1.0, 4.0)))
+        for track in range(4)
+        for candidate in range(4)
+        if rng.random() < 0.6
+    ]
+    expected = every_assignment(pairs)
+    expected = [each for each in expected if each[0] > expected[0][0] - LARGEST_LOSS]
+    found = best_assignments(pairs, most=6)
+    assert len(found) == min(6, len(expected))
+    for own, (gain, taken) in zip(found, expected, strict=False):
+        assert own.gain == pytest.approx(gain)
+        assert frozenset(own.pairs) == taken
+
+
+def test_the_order_of_the_pairs_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    pairs = [(i, j, float(rng.normal())) for i in range(5) for j in range(5)]
+    shuffled = [pairs[k] for k in rng.permutation(len(pairs))]
+    own, other = (best_assignments(each, 8) for each in (pairs, shuffled))
+    assert [sorted(each.pairs) for each in own] == [
+        sorted(each.pairs) for each in other
+    ]
+
+
+def test_without_pairs_all_tracks_are_missed() -> None:
+    [only] = best_assignments([], 3)
+    assert only.gain == 0.0
+    assert only.pairs == ()
