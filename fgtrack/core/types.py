@@ -292,7 +292,7 @@ class Revision:
 
 
 class FinalTrack(NamedTuple):
-    """What a track was in the end: one row of final_tracks.csv."""
+    """A track as it was in the end: one row of final_tracks.csv."""
 
     track_id: int
     first_stamp_ns: int

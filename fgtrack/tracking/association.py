@@ -250,8 +250,7 @@ class GatedMahalanobis(Association):
 class Hypotheses(Association):
     """Decisions by the likeliest of a few hypotheses about all detections inside the horizon.
 
-    Each hypothesis says which detections belong together, which are clutter, and which objects exist (a Poisson
-    multi-Bernoulli mixture). Lists count in the order of their stamps: a late list changes the decisions about newer
+    Each hypothesis assigns every detection to an object or to clutter (a Poisson multi-Bernoulli mixture). Lists count in the order of their stamps: a late list changes the decisions about newer
     ones. It needs `lifecycle.kind: existence`.
     """
 

@@ -35,8 +35,8 @@ _GATE_PROBABILITY = 0.9999
 class DecidedTracker(MultiObjectTracker):
     """Decides about all lists in the order of their stamps, and lets the estimators follow.
 
-    A late list changes decisions about newer lists. A track whose detections have changed is estimated again from its
-    first detection.
+    A late list changes decisions about newer lists. If the detections of a track change, its estimator starts once
+    more with the first detection.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -233,7 +233,7 @@ class DecidedTracker(MultiObjectTracker):
         changes: Sequence[Explained],
         named: Sequence[list[int | None]],
     ) -> None:
-        """Estimate the tracks whose detections have changed again, and publish the decisions."""
+        """Publish the decisions. Estimate the tracks whose detections have changed once more."""
         again: set[int] = set()
         added: list[tuple[Entry, list[int]]] = []
         for each, own in zip(changes, named, strict=True):
@@ -297,9 +297,9 @@ class DecidedTracker(MultiObjectTracker):
         return self._tracks.bank_id(public) is None
 
     def _rebuild(self, public: int, newest: Entry | None = None) -> None:
-        """Estimate a track again from its first detection.
+        """Estimate a track once more, from its first detection.
 
-        The detections of a track that began before the horizon cannot all be fused again, so it keeps its state.
+        The detections of a track that began before the horizon cannot all be fused once more, so it keeps its state.
         """
         root = self._roots.get(public)
         bank_id = self._tracks.bank_id(public)

@@ -12,6 +12,7 @@ from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.decided_tracker import DecidedTracker
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -96,7 +97,11 @@ def test_every_configuration_can_be_built(path: Path) -> None:
     config = load(Config, path)
     tracker = build_tracker(config)
     assert type(tracker) is (
-        PublishedTracker if config.lifecycle.kind == "published" else MultiObjectTracker
+        PublishedTracker
+        if config.lifecycle.kind == "published"
+        else DecidedTracker
+        if config.association.kind == "hypotheses"
+        else MultiObjectTracker
     )
 
 

@@ -26,7 +26,7 @@ _SPEED_OF_CLUTTER_MPS = 30.0
 def decision_motion(motion: MotionModel) -> MotionModel:
     """Return the motion model of decisions: `motion`, or `CT` with its noise for a state with yaw and speed.
 
-    A first position says nothing of a direction. A Cartesian velocity expresses this without an assumed yaw.
+    A first position gives no direction. A Cartesian velocity expresses this without an assumed yaw.
     """
     if motion.cartesian:
         return motion

@@ -39,7 +39,7 @@ class Life:
 
 
 class DecidedLives(Stateful):
-    """Lives of the tracks, as the decisions say; see `fgtrack.tracking.lives.existence` for the other methods."""
+    """Lives of the tracks according to the decisions; see `fgtrack.tracking.lives.existence` for the other methods."""
 
     STATE: ClassVar[tuple[str, ...]] = ("lives", "_present_ns", "_known_ns", "_ended")
 
@@ -72,7 +72,7 @@ class DecidedLives(Stateful):
         return [i for i, stamp_ns in self._ended.items() if stamp_ns < oldest_ns]
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
-        """The decisions know of the birth already."""
+        """Nothing is to do: the decisions contain the birth."""
 
     def matched(
         self,
@@ -81,10 +81,10 @@ class DecidedLives(Stateful):
         pairs: Sequence[tuple[int, int]],
         states: StatesAt,
     ) -> None:
-        """The decisions know of the match already."""
+        """Nothing is to do: the decisions contain the match."""
 
     def fused(self, track_ids: Iterable[int]) -> None:
-        """The decisions know of the match already."""
+        """Nothing is to do: the decisions contain the match."""
 
     def expired(
         self,

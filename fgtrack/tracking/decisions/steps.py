@@ -1,7 +1,6 @@
 """Hypotheses about the tracks after each object list: a Poisson multi-Bernoulli mixture.
 
-A hypothesis says of each detection up to a list whether it continues a track, starts one, or
-is clutter. The few best hypotheses are kept. A track of a hypothesis is a Bernoulli
+A hypothesis assigns each detection up to a list to a track, to a new track, or to clutter. The few best hypotheses are kept. A track of a hypothesis is a Bernoulli
 component: the probability that its object has ever existed, the probability that the object
 still exists, and a Gaussian state.
 
@@ -533,7 +532,7 @@ def _first_state(
 def _correct(
     group: Group, members: IntArray, means: FloatArray, covariances: FloatArray
 ) -> None:
-    """Fuse members of a group into the states (p, n), (p, n, n), in place."""
+    """Fuse members of a group into the states (p, n), (p, n, n), which are overwritten."""
     own = group.stack
     y, H = own.model.linearised(own.z.take(members, axis=0), means, own.pose)
     p, k = y.shape
@@ -831,7 +830,7 @@ def _own(nodes: Nodes, rows: IntArray, rules: Rules) -> FloatArray:
     """Return the probability that each track is an object of its own, shape (n,), and no second return of a track in
     `rows`.
 
-    The second return keeps its place on the hull: the distance of both tracks is normal with the standard deviation
+    The second return moves with the hull: the distance of both tracks is normal with the standard deviation
     of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
     velocity of its own. A track with fewer detections may be a second return of a track with more detections.
     """
