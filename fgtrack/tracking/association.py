@@ -250,8 +250,9 @@ class GatedMahalanobis(Association):
 class Hypotheses(Association):
     """Decisions by the likeliest of a few hypotheses about all detections inside the horizon.
 
-    Each hypothesis assigns every detection to an object or to clutter (a Poisson multi-Bernoulli mixture). Lists count in the order of their stamps: a late list changes the decisions about newer
-    ones. It needs `lifecycle.kind: existence`.
+    Each hypothesis assigns every detection to an object or to clutter (a Poisson multi-Bernoulli mixture). Lists count
+    in the order of their stamps: a late list changes the decisions about newer ones. The association needs
+    `lifecycle.kind: existence`.
     """
 
     kind: Literal["hypotheses"] = "hypotheses"

@@ -63,7 +63,7 @@ class Tracks(Stateful):
         return self._public.get(bank_id, bank_id)
 
     def drop(self, bank_id: int) -> None:
-        """End a track whose last smoothed states are not published: its estimator starts once more, or no object exists."""
+        """End a track without publishing its last smoothed states."""
         self._dropped.add(bank_id)
         self.end([bank_id])
 

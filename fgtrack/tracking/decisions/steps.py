@@ -1,8 +1,9 @@
 """Hypotheses about the tracks after each object list: a Poisson multi-Bernoulli mixture.
 
-A hypothesis assigns each detection up to a list to a track, to a new track, or to clutter. The few best hypotheses are kept. A track of a hypothesis is a Bernoulli
-component: the probability that its object has ever existed, the probability that the object
-still exists, and a Gaussian state.
+A hypothesis assigns each detection up to a list to a track, to a new track, or to clutter. The
+few best hypotheses are kept. A track of a hypothesis is a Bernoulli component: the probability
+that its object has ever existed, the probability that the object still exists, and a Gaussian
+state.
 
 Sources: Williams, "Marginal multi-Bernoulli filters", IEEE T-AES 51(3), 2015, and
 Garcia-Fernandez, Williams, Granstrom, Svensson, "Poisson multi-Bernoulli mixture filter",
