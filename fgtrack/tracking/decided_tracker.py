@@ -14,10 +14,10 @@ from fgtrack.core.types import (
     Revision,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Start, StatesAt
+from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
-from fgtrack.tracking.decisions.entries import Entry
+from fgtrack.tracking.decisions.entries import Entry, Starts
 from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
 from fgtrack.tracking.decisions.steps import NONE, Ended
@@ -143,11 +143,7 @@ class DecidedTracker(MultiObjectTracker):
                     score = (max(own) - sensor.score.even) / sensor.score.scale
                     scores[position] = min(max(score, -10.0), 10.0)
         may_start = np.array(candidates.placed, dtype=bool) & sensor.births
-        ego, in_pit = self._ego(scan), parts.ego.in_pit
-
-        def start(position: int) -> Start | None:
-            return parts.birth.prior(candidates[position], parts.road, ego, in_pit)
-
+        starts = Starts(parts.birth, parts.road, self._ego(scan), parts.ego.in_pit)
         return Entry(
             posed.batch,
             candidates,
@@ -157,7 +153,7 @@ class DecidedTracker(MultiObjectTracker):
             self.decisions.motion,
             scores,
             may_start,
-            start,
+            starts,
         )
 
     def _ego(self, scan: Scan) -> EgoState | None:

@@ -157,7 +157,9 @@ class Group(NamedTuple):
             measured_position(own.model.components, z, C, own.pose)
             for z, C in zip(own.z[members], R, strict=True)
         ]
-        return np.array([each[1] for each in positions if each is not None])
+        return np.array([each[1] for each in positions if each is not None]).reshape(
+            -1, 2, 2
+        )
 
 
 class Candidates(Lazy[Candidate]):

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from fgtrack import Config, Detection, DetectionList, FloatArray
+from fgtrack.core.state import from_bytes, to_bytes
 from fgtrack.core.types import Disposition, FinalTrack, Revision, UpdateRecord
 from fgtrack.pipeline.build import build_tracker
+from fgtrack.tracking.tracker_state import TrackerState
 
 SECOND = 1_000_000_000
 LENGTH_S = 8.0
@@ -215,6 +217,11 @@ def test_a_checkpoint_of_the_decisions_goes_on_with_the_same_bits() -> None:
 
     first = rest()
     tracker.restore(saved)
+    assert rest() == first
+    tracker = build_tracker(config)
+    loaded = from_bytes(to_bytes(saved))
+    assert isinstance(loaded, TrackerState)
+    tracker.restore(loaded)
     assert rest() == first
 
 

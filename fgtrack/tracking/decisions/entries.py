@@ -1,22 +1,24 @@
 """One object list, ready for decisions."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.types import BoolArray, Detection, FloatArray
+from fgtrack.core.types import BoolArray, Detection, EgoState, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import CT, MotionModel
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.lives.counters import Scan
-from fgtrack.tracking.preprocess import Candidates, Group, StampError
+from fgtrack.tracking.preprocess import Candidate, Candidates, Group, StampError
 
 #: Components that a velocity along the axes of the map does not show well at low speed, or that are no measurement.
 _LEFT_OUT = {"yaw_rad", "curvature_radpm"}
@@ -90,6 +92,21 @@ def _most(counts: Mapping[str, int]) -> str | None:
     return max(sorted(counts), key=counts.__getitem__) if counts else None
 
 
+@dataclass(frozen=True)
+class Starts:
+    """First states of the tracks that the candidates of a list would start."""
+
+    birth: Birth
+    road: Road
+    ego: EgoState | None
+    """Ego at the stamp of the list."""
+    ego_in_pit: bool
+
+    def of(self, candidate: Candidate) -> Start | None:
+        """Return the first state of the track that a candidate would start; None without a position."""
+        return self.birth.prior(candidate, self.road, self.ego, self.ego_in_pit)
+
+
 @dataclass(eq=False)
 class Entry:
     """An object list with its candidates."""
@@ -105,8 +122,7 @@ class Entry:
     """Logarithms of p(score | object) / p(score | clutter), shape (m,)."""
     may_start: BoolArray
     """True for each candidate that may start a track, shape (m,)."""
-    make_start: Callable[[int], Start | None]
-    """Returns the first state of the track that a candidate would start; None without one."""
+    starts: Starts
     roots: list[int] = field(default_factory=list)
     """Numbers of the tracks that the candidates would start."""
     number: int = 0
@@ -117,7 +133,7 @@ class Entry:
     def start(self, position: int) -> Start | None:
         """Return the first state of the track that a candidate would start; None without one."""
         if position not in self._starts:
-            self._starts[position] = self.make_start(position)
+            self._starts[position] = self.starts.of(self.candidates[position])
         return self._starts[position]
 
     @cached_property
