@@ -54,6 +54,13 @@ _MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
 _DEVIATIONS = 2.0  # half axes of an ellipse, in standard deviations
 _SHOWN_S = 0.5  # display time of a list, unless a later list of its sensor replaces it
 _DOT_M, _BEARING_M = 1.0, 150.0
+# Entries of the covariance of x, y and yaw, row by row.
+_COVARIANCE = (
+    *("p_x_x", "p_x_y", "p_x_yaw"),
+    *("p_x_y", "p_y_y", "p_y_yaw"),
+    *("p_x_yaw", "p_y_yaw", "p_yaw_yaw"),
+)
+_POSE = ("x_m", "y_m", "yaw_rad", *_COVARIANCE)
 # Number of times whose messages are made together.
 _BLOCK_TIMES = 256
 _USED = (*FUSED, Disposition.MERGED)
@@ -120,6 +127,9 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
 def truth_messages(truth: Columns) -> Messages:
     """Yield boxes and poses of the true objects at every stamp, without the ego."""
     table = with_position(truth.where(truth["object_id"] != EGO_ID))
+    # A long column is read from the file at each use, so the blocks come from columns in memory.
+    names = ("stamp_ns", "object_id", "x_m", "y_m", "yaw_rad")
+    table = Columns({name: table[name] for name in names})
     before: set[str] = set()
     for rows in _blocks(table["stamp_ns"], np.unique(table["stamp_ns"])):
         yield from _merged(_truth_messages(table.where(rows), before))
@@ -162,8 +172,9 @@ def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
 
 def _tick_messages(run: Run, layer: RunLayer) -> Messages:
     """Yield the messages of all ticks, of which some hundred are in memory at a time."""
-    tracks = run.tables["tracks"]
     timing = run.tables["timing"]
+    names = ("now_ns", "stamp_ns", "track_id", "status", "speed_mps", *_POSE)
+    tracks = Columns({name: run.tables["tracks"][name] for name in names})
     times_ns = np.union1d(timing["now_ns"], tracks["now_ns"])
     before = _Before()
     blocks = zip(
@@ -480,20 +491,9 @@ def _states(states: Columns, objects: Columns) -> list[Detection]:
             objects, "track_id", "length_m", "width_m", "height_m", "class_name"
         )
     }
-    names = (
-        "p_x_x",
-        "p_x_y",
-        "p_x_yaw",
-        "p_x_y",
-        "p_y_y",
-        "p_y_yaw",
-        "p_x_yaw",
-        "p_y_yaw",
-        "p_yaw_yaw",
-    )
     result = []
     for x_m, y_m, yaw_rad, track_id, *covariance in _rows(
-        states, "x_m", "y_m", "yaw_rad", "track_id", *names
+        states, "x_m", "y_m", "yaw_rad", "track_id", *_COVARIANCE
     ):
         P = tuple(covariance) if math.isfinite(yaw_rad + sum(covariance)) else None
         result.append(
