@@ -25,7 +25,7 @@ _HOMES = {
     "NO_TRACK": "fgtrack.runs",
     "PREDICTION_STEP_S": "fgtrack.evaluation.scores.prediction",
     "RUN": "fgtrack.evaluation.tables",
-    "Scenes": "fgtrack.evaluation.scenes",
+    "Scenes": "fgtrack.evaluation.near_pairs",
     "Statistic": "fgtrack.evaluation.intervals",
     "Table": "fgtrack.evaluation.tables",
     "Tables": "fgtrack.evaluation.tables",
@@ -70,9 +70,9 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.matching import position_nees as position_nees
     from fgtrack.evaluation.matching import scenes as scenes
     from fgtrack.evaluation.metrics import Metrics as Metrics
+    from fgtrack.evaluation.near_pairs import Scenes as Scenes
     from fgtrack.evaluation.runs import EvaluatedRun as EvaluatedRun
     from fgtrack.evaluation.runs import evaluated as evaluated
-    from fgtrack.evaluation.scenes import Scenes as Scenes
     from fgtrack.evaluation.scores.innovations import LOCAL_NAMES as LOCAL_NAMES
     from fgtrack.evaluation.scores.innovations import Consistency as Consistency
     from fgtrack.evaluation.scores.innovations import (

@@ -7,7 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
-from fgtrack.evaluation.scenes import NearPairs, Scenes, assigned
+from fgtrack.evaluation.near_pairs import NearPairs, Scenes, assigned
 from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import (
     TruePath,

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import average
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 from fgtrack.evaluation.scores.multi_object import multi_object_metrics
 from fgtrack.evaluation.scores.t_gospa import t_gospa
 from fgtrack.evaluation.tables import Column, Table

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from fgtrack.evaluation.matching import (
     nearest_objects,
     track_errors,
 )
-from fgtrack.evaluation.scenes import NearPairs
+from fgtrack.evaluation.near_pairs import NearPairs
 from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.runs import NO_TRACK

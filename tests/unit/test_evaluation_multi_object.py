@@ -17,7 +17,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 from fgtrack.evaluation.scores.multi_object import (
     MultiObjectMetrics,
     gospa,

@@ -9,7 +9,7 @@ from evaluation_scenes import random_scenes
 from scipy.optimize import linprog
 from support.messages import shared
 
-from fgtrack.evaluation.scenes import NearPairs, Scenes
+from fgtrack.evaluation.near_pairs import NearPairs, Scenes
 from fgtrack.evaluation.scores.t_gospa import t_gospa
 
 C_M = 5.0

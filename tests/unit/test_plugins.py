@@ -146,7 +146,8 @@ def test_every_estimator_is_made_by_name(name: str) -> None:
 def test_options_that_an_estimator_does_not_take_are_refused() -> None:
     start = Start()
     with pytest.raises(
-        CallError, match=r"^ekf-replay: .*'hold_s'; its options are initiation, lagged_s$"
+        CallError,
+        match=r"^ekf-replay: .*'hold_s'; its options are initiation, lagged_s$",
     ):
         estimator("ekf-replay", CV(), start, hold_s=0.1)
     with pytest.raises(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 
 #: Similarity thresholds of HOTA.
 _THRESHOLDS = np.arange(1, 20) / 20.0

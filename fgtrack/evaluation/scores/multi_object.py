@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 from fgtrack.evaluation.scores.continuity import switches
 from fgtrack.evaluation.scores.identities import hota, identity
 from fgtrack.evaluation.scores.registry import registered_metrics

@@ -7,7 +7,7 @@ with p = 2.
 
 import numpy as np
 
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 
 
 def ospa(scenes: Scenes, c_m: float) -> dict[str, float]:

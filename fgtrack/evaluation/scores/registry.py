@@ -7,7 +7,7 @@ from typing import Protocol
 from fgtrack.core.checks import is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
-from fgtrack.evaluation.scenes import Scenes
+from fgtrack.evaluation.near_pairs import Scenes
 
 
 class Metric(Protocol):

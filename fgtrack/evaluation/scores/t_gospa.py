@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fgtrack.core.errors import FgtrackError
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.scenes import NearPairs, Scenes
+from fgtrack.evaluation.near_pairs import NearPairs, Scenes
 
 __all__ = ["t_gospa"]
 
