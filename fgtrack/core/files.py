@@ -1,6 +1,7 @@
 """Opening and reading of files that a user names: regular files only, up to a size that fits into memory."""
 
 import errno
+from collections.abc import Iterator
 from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO
@@ -8,6 +9,8 @@ from typing import BinaryIO
 from fgtrack.core.errors import DataError
 
 GZIP_MAGIC = b"\x1f\x8b"
+_PIECE = 2**24
+"""Bytes that one read takes."""
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -28,6 +31,13 @@ def open_text(
     return TextIOWrapper(open_file(path), encoding=encoding, newline=newline)
 
 
+def _pieces(file: BinaryIO, most: int) -> Iterator[bytes]:
+    """Yield the next bytes of a file, at most `most`. A single read would reserve memory for all of them."""
+    while most > 0 and (piece := file.read(min(most, _PIECE))):
+        yield piece
+        most -= len(piece)
+
+
 def read_whole(path: Path, largest_mb: float) -> bytes:
     """Return the content of `path`.
 
@@ -36,7 +46,7 @@ def read_whole(path: Path, largest_mb: float) -> bytes:
     largest = int(largest_mb * 1e6)
     try:
         with open_file(path) as file:
-            content = file.read(largest + 1)
+            content = b"".join(_pieces(file, largest + 1))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if len(content) > largest:

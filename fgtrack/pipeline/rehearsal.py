@@ -184,12 +184,12 @@ class _Scene:
         car = self._ego(at_ns).moved(ahead_m, left_m, math.pi if is_flipped else 0.0)
         values = self._measured(at_ns, car, _frame(k), sensor)
         variances = [sensor.std[name] ** 2 for name in sensor.components]
-        has_own, describes = k % 3 == 2, k % 2 == 1
+        has_own, describes, rule = k % 3 == 2, k % 2 == 1, sensor.score
         return Detection(
             **{name: values[name] for name in sensor.components},  # type: ignore[arg-type]  # names of values
             covariance=tuple(np.diag(variances).ravel().tolist()) if has_own else None,
             stamp_ns=at_ns - row * 1_000_000 if k % 5 == 4 else None,
-            score=0.9,
+            score=0.9 if rule is None else rule.even + 5.0 * rule.scale,
             class_name="car" if describes else None,
             length_m=4.5 if describes else None,
             width_m=1.8 if describes else None,

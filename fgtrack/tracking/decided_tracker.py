@@ -44,7 +44,6 @@ class DecidedTracker(MultiObjectTracker):
         "decisions",
         "_public",
         "_roots",
-        "_next_public",
         "_next_rebuilt",
         "_revisions",
         "_final",
@@ -61,7 +60,6 @@ class DecidedTracker(MultiObjectTracker):
         """Public number of each root."""
         self._roots: dict[int, int] = {}
         """Root of each public number."""
-        self._next_public = 0
         self._next_rebuilt = _FIRST_REBUILT
         self._of: dict[int, list[int | None]] = {}
         """Published track of each candidate, by the number of its list; None without a track."""
@@ -200,9 +198,8 @@ class DecidedTracker(MultiObjectTracker):
                     own.append(None)
                     continue
                 if root not in self._public:
-                    self._public[root] = self._next_public
-                    self._roots[self._next_public] = root
-                    self._next_public += 1
+                    public = self._tracks.next_number()
+                    self._public[root], self._roots[public] = public, root
                 own.append(self._public[root])
             named.append(own)
         return named

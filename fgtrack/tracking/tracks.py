@@ -83,12 +83,16 @@ class Tracks(Stateful):
         """Return the number of a new track. A former track with the identity of `detection` passes on its number."""
         track_id = self._parts.objects.former(detection)
         if track_id is None:
-            self._next_id += 1
-            return self._next_id - 1
+            return self.next_number()
         if track_id in self.num_measured:  # lost
             self._parts.objects.id_conflicts["reused"] += 1
             self.end([track_id])
         return track_id
+
+    def next_number(self) -> int:
+        """Return the next number of a track, which is not given again."""
+        self._next_id += 1
+        return self._next_id - 1
 
     def begin(self, track_id: int, sensor: str, prior: Start) -> None:
         """Note a track that the first detection of `sensor` has started."""

@@ -120,7 +120,8 @@ def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(
 def test_without_truth_no_run_is_judged(folder: Path, found: list[CloseUp]) -> None:
     runs = [fgtrack.load_run(folder / "runs" / name) for name in NAMES]
     blind = [
-        run.with_tables(truth=run.tables["truth"].where(slice(0, 0))) for run in runs
+        run.with_tables(truth=run.tables["truth"].where(np.zeros(0, dtype=np.int64)))
+        for run in runs
     ]
     figure = fgtrack.plot.close_up(blind, found)
     assert faults(figure) == []

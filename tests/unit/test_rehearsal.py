@@ -127,7 +127,7 @@ def test_a_tick_imports_nothing_that_making_its_tracker_has_not(
         linalg.kernels,
         linalg._lapack,
         association.chi_square_quantile,
-        association._quantiles,
+        association.quantiles,
     ):
         cache.cache_clear()
     monkeypatch.setattr(rehearsal, "_rehearsed", set())

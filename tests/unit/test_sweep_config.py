@@ -141,7 +141,7 @@ one_at_a_time:
         ("seed: 3", "seed: unknown key, did you mean 'seeds'"),
         (
             "seeds: 100001",
-            "vary: 100001 combinations of values and seeds, at most 100000",
+            "vary: 100001 combinations of values, seeds and recordings, at most 100000",
         ),
         ("seeds: [1, 1]", "seeds: give at least one, and each only once"),
         ("seeds: [-1]", "seeds.0: Input should be greater than or equal to 0"),
