@@ -14,7 +14,7 @@ from fgtrack.core.types import (
     Revision,
     UpdateRecord,
 )
-from fgtrack.estimation.base import StatesAt
+from fgtrack.estimation.base import Measurement, Measurements, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
 from fgtrack.tracking.decisions.entries import Entry, Starts
@@ -49,11 +49,13 @@ class DecidedTracker(MultiObjectTracker):
         "_final",
         "_ended",
         "_of",
+        "_fused_as",
         "num_revisions",
     )
 
     def __init__(self, parts: TrackerParts, decisions: Decisions) -> None:
         super().__init__(parts)
+        self._update.kept = {}
         self.decisions = decisions
         self._lives = cast(DecidedLives, parts.lifecycle)
         self._public: dict[int, int] = {}
@@ -63,6 +65,8 @@ class DecidedTracker(MultiObjectTracker):
         self._next_rebuilt = _FIRST_REBUILT
         self._of: dict[int, list[int | None]] = {}
         """Published track of each candidate, by the number of its list; None without a track."""
+        self._fused_as: dict[tuple[int, int], tuple[int, Measurement, int]] = {}
+        """Track in the bank, stack and row of each fused candidate, by the number of its list and its position."""
         self.num_revisions = 0
         """Number of changes of a detection's track by late data."""
         self._revisions: list[Revision] = []
@@ -122,7 +126,8 @@ class DecidedTracker(MultiObjectTracker):
         oldest_ns = self._parts.bank.window_start_ns
         settled = self.decisions.forget(oldest_ns)
         for each in settled:
-            del self._of[each.entry.number]
+            for position in range(len(self._of.pop(each.entry.number))):
+                self._fused_as.pop((each.entry.number, position), None)
         _settle(settled, self._final, self._ended)
         self._tracks.end(self._lives.ended_before(oldest_ns))
 
@@ -228,6 +233,8 @@ class DecidedTracker(MultiObjectTracker):
     ) -> None:
         """Publish the decisions. Estimate the tracks whose detections have changed once more."""
         again: set[int] = set()
+        lost: list[tuple[Entry, int, int]] = []
+        won: list[tuple[Entry, int, int]] = []
         added: list[tuple[Entry, list[int]]] = []
         for each, own in zip(changes, named, strict=True):
             before = self._of[each.entry.number]
@@ -240,17 +247,27 @@ class DecidedTracker(MultiObjectTracker):
                     self._note(each.entry, position, old, public)
                 if old is not None:
                     again.add(old)
+                    lost.append((each.entry, position, old))
                 if public is not None:
                     is_birth = each.taken[position] == each.entry.roots[position]
                     if self._is_unknown(public) != (is_birth and is_new):
                         again.add(public)
                     new_positions.append(position)
+                    won.append((each.entry, position, public))
             self._of[each.entry.number] = own
             if new_positions:
                 added.append((each.entry, new_positions))
         self._results: dict[int, UpdateRecord] = {}
         for public in sorted(again):
-            self._rebuild(public, entry)
+            if self._began_before_horizon(public):
+                for lost_entry, position, old in lost:
+                    if old == public:
+                        self._withdraw(lost_entry, position)
+                for won_entry, position, new in won:
+                    if new == public:
+                        self._fuse(won_entry, [position], won_entry is entry)
+            else:
+                self._rebuild(public, entry)
         for each_entry, positions in added:
             rest = [p for p in positions if self._of[each_entry.number][p] not in again]
             births = [
@@ -289,31 +306,37 @@ class DecidedTracker(MultiObjectTracker):
         """True for a track that no estimator holds."""
         return self._tracks.bank_id(public) is None
 
-    def _rebuild(self, public: int, newest: Entry | None = None) -> None:
-        """Estimate a track once more, from its first detection.
+    def _began_before_horizon(self, public: int) -> bool:
+        """True for a track that an estimator holds, and whose first detection is decided for good."""
+        root, entries = self._roots.get(public), self.decisions.entries
+        return not self._is_unknown(public) and not any(
+            root in entry.roots for entry in entries
+        )
 
-        The detections of a track that began before the horizon cannot all be fused once more, so it keeps its state.
-        """
-        root = self._roots.get(public)
-        bank_id = self._tracks.bank_id(public)
-        dets = [
-            (entry, position)
-            for entry in self.decisions.entries
-            for position, each in enumerate(self._of[entry.number])
-            if each == public
-        ]
-        if dets and dets[0][0].roots[dets[0][1]] != root and bank_id is not None:
-            for entry, position in dets:
-                if entry is newest:
-                    self._fuse(entry, [position], is_recorded=True)
+    def _withdraw(self, entry: Entry, position: int) -> None:
+        """Undo the fusion of a candidate with its former track. A bank that cannot undo it keeps it."""
+        known = self._fused_as.pop((entry.number, position), None)
+        if known is None:
             return
+        bank_id, stack, row = known
+        if self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
+            self._tracks.num_measured[bank_id] -= 1
+
+    def _rebuild(self, public: int, newest: Entry | None = None) -> None:
+        """Estimate a track once more, from its first detection inside the horizon."""
+        bank_id = self._tracks.bank_id(public)
         if bank_id is not None:
             self._tracks.drop(bank_id)
-        for k, (entry, position) in enumerate(dets):
-            if k == 0:
-                self._birth(entry, position, is_again=True)
-            else:
-                self._fuse(entry, [position], entry is newest)
+        is_first = True
+        for entry in self.decisions.entries:
+            for position, each in enumerate(self._of[entry.number]):
+                if each != public:
+                    continue
+                if is_first:
+                    self._birth(entry, position, is_again=True)
+                    is_first = False
+                else:
+                    self._fuse(entry, [position], entry is newest)
 
     def _birth(self, entry: Entry, position: int, is_again: bool = False) -> None:
         """Start the estimator of a track."""
@@ -366,7 +389,12 @@ class DecidedTracker(MultiObjectTracker):
             return
         assignment = self._readings(entry, pairs, states)
         records: list[Iterable[UpdateRecord]] = []
+        kept = self._update.kept = {}
         self._update.fuse(entry.batch, entry.candidates, assignment, states, records)
+        for k, (stack, row) in kept.items():
+            position, track = pairs[k]
+            bank_id = states.track_ids[track]
+            self._fused_as[entry.number, position] = bank_id, stack, row
         if parts.objects.describes(entry.scan.objects):
             for position, track in pairs:
                 parts.objects.learn(
@@ -434,7 +462,8 @@ class DecidedTracker(MultiObjectTracker):
             life = self._lives.lives.get(bank_id)
             was_confirmed = life is not None and life.is_confirmed
             begun = self._roots.get(self._tracks.public(bank_id))
-            if begun in roots and not was_confirmed:
+            is_single = self._tracks.num_measured[bank_id] < 2
+            if begun in roots and is_single and not was_confirmed:
                 self._tracks.drop(bank_id)
             else:
                 self._lives.suspend(bank_id, step.stamp_ns)

@@ -177,6 +177,20 @@ class GuardedBank(Stateful):
                     )
         return results
 
+    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
+        """Undo the fusion of a measurement. Return False if the estimator cannot, or does not have the measurement.
+
+        A track that raises ends.
+        """
+        bank: Any = self._bank  # Any: not each bank has `withdraw`
+        if track_id not in self._alive or not hasattr(bank, "withdraw"):
+            return False
+        try:
+            return bool(bank.withdraw(track_id, measurement))
+        except Exception as error:
+            self._end({track_id: error}, Failure.UPDATE_FAILED)
+            return False
+
     def _updated(
         self,
         stamp_ns: int,

@@ -31,6 +31,8 @@ class ListUpdate:
         self, parts: TrackerParts, tracks: Tracks, association: ListAssociation
     ) -> None:
         self._parts, self._tracks, self._association = parts, tracks, association
+        self.kept: dict[int, tuple[Measurement, int]] | None = None
+        """Stack and row of each measurement of the newest list, by the index of its pair; None if nobody asks."""
 
     def fuse(
         self,
@@ -115,6 +117,10 @@ class ListUpdate:
         results = self._parts.bank.update(stack.stamp_ns, ids, measurements)
         made = zip(repeat(stack), results)
         outcomes.update(zip(pairs.tolist(), made, strict=True))
+        if self.kept is not None:
+            self.kept.update(
+                (pair, (stack, row)) for row, pair in enumerate(pairs.tolist())
+            )
         fused = [row for row, each in enumerate(results) if each.innovation is not None]
         for row in fused:
             self._tracks.num_measured[ids[row]] += 1

@@ -45,7 +45,9 @@ def configuration(estimator: str, **others: Any) -> Config:
     )
 
 
-def scene(seed: int, num_objects: int = 6) -> Lists:
+def scene(
+    seed: int, num_objects: int = 6, detected: float = 0.85, clutter: float = CLUTTER
+) -> Lists:
     """Return the lists of two sensors: objects that appear and disappear, misses and clutter."""
     rng = np.random.default_rng(seed)
     first_m = rng.uniform(-SIDE_M / 2.0, SIDE_M / 2.0, (num_objects, 2))
@@ -67,10 +69,10 @@ def scene(seed: int, num_objects: int = 6) -> Lists:
                 + velocity_mps[k] * (t_s - begin_s[k])
                 + rng.normal(0.0, STDS[sensor], 2)
                 for k in range(num_objects)
-                if begin_s[k] <= t_s < end_s[k] and rng.random() < 0.85
+                if begin_s[k] <= t_s < end_s[k] and rng.random() < detected
             ]
             seen += list(
-                rng.uniform(-SIDE_M / 2.0, SIDE_M / 2.0, (rng.poisson(CLUTTER), 2))
+                rng.uniform(-SIDE_M / 2.0, SIDE_M / 2.0, (rng.poisson(clutter), 2))
             )
             objects = [Detection(x_m=float(x), y_m=float(y)) for x, y in seen]
             lists.append((sensor, round(t_s * SECOND), objects))
@@ -170,6 +172,23 @@ def test_late_lists_give_the_tracks_of_a_stream_in_order(seed: int) -> None:
     assert not in_order.revisions or all(
         each.old_track_id != each.track_id for each in in_order.revisions
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
+@pytest.mark.parametrize("seed", range(6))
+def test_dense_clutter_in_any_order(estimator: str, seed: int) -> None:
+    lists = scene(seed, num_objects=12, detected=0.7, clutter=8.0)
+    config = configuration(estimator)
+    in_order = outcome(lists, [0] * len(lists), config)
+    found = outcome(lists, delays(lists, seed, 1.0), config)
+    np.testing.assert_allclose(
+        as_array(found.states),
+        as_array(in_order.states),
+        atol=0.0 if estimator == "ekf-replay" else 1e-6,
+        rtol=0.0,
+    )
+    assert found.groups() == in_order.groups()
 
 
 @pytest.mark.parametrize("estimator", ["smoother-banded", "smoother"])

@@ -31,6 +31,7 @@ from fgtrack.estimation.base import (
     stacks,
 )
 from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf
@@ -261,6 +262,26 @@ class ReplayBank(Stateful):
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
         """True if the window has an identical measurement of this track."""
+        return self._index_of(track_id, measurement) is not None
+
+    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
+        """Filter a track without a measurement, as if it had never been fused. Return False if the window does not
+        have it.
+
+        False also for a track that is replayed step by step. Raises `EstimatorError` if a later measurement can no
+        longer be fused.
+        """
+        index, row = self._index_of(track_id, measurement), self._rows[track_id]
+        if not index or row in self._outside:
+            return False
+        model, rows = (self._kind, self._noise), np.array([row])
+        if not kernels(KERNELS).withdraw(*model, self._arrays, rows, index):
+            cause = np.linalg.LinAlgError("a measurement can no longer be fused")
+            raise EstimatorError({track_id: cause}, {})
+        return True
+
+    def _index_of(self, track_id: int, measurement: Measurement) -> int | None:
+        """Return the index of the step with an identical measurement; None without one."""
         row, seen = self._rows[track_id], measurement.seen_by(self._motion)
         order, labels, _, windows, measured, views = (
             each[row] for each in self._arrays
@@ -268,13 +289,15 @@ class ReplayBank(Stateful):
         k = len(seen.z)
         loss, width = compiled_form(seen.loss, k)
         label = [seen.stamp_ns, k, loss, *seen.model.codes.tolist()]
-        return any(
-            labels[slot, : len(label)].tolist() == label
-            and (measured[slot, 0, :k] == seen.z).all()
-            and (measured[slot, 1 : k + 1, :k] == seen.R).all()
-            and views[slot].tolist() == [*seen.pose, width]
-            for slot in order[: windows[0]].tolist()
-        )
+        for index, slot in enumerate(order[: windows[0]].tolist()):
+            if (
+                labels[slot, : len(label)].tolist() == label
+                and (measured[slot, 0, :k] == seen.z).all()
+                and (measured[slot, 1 : k + 1, :k] == seen.R).all()
+                and views[slot].tolist() == [*seen.pose, width]
+            ):
+                return index
+        return None
 
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement

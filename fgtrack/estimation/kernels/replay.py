@@ -184,6 +184,40 @@ def fuse(
     return num_without_room
 
 
+@njit(f"b1(int64, float64[::1], {BANK}, int64[::1], int64)")
+def withdraw(
+    kind: int, noise: FloatArray, bank: Bank, tracks: IntArray, index: int
+) -> bool:
+    """Take the step at `index` out of the first of `tracks`, and re-filter the later measurements without it.
+
+    False if a later measurement can no longer be fused; the states are then those of the other measurements as far as
+    this measurement.
+    """
+    n = bank[2].shape[3]
+    check_noise(kind, noise, n)
+    check_bank(tracks, 0, bank, n)
+    check(len(tracks) > 0)
+    track = track_of(bank, tracks[0])
+    slots, labels, steps, window, _, _ = track
+    count = window[COUNT]
+    check(0 < index < count)
+    space = replay_space(n, bank[4].shape[3])
+    innovation, H, _, smoothing, correction = space
+    own = slots[index]
+    for later in range(index, count - 1):
+        slots[later] = slots[later + 1]
+    slots[count - 1] = own
+    window[COUNT] = count - 1
+    window[NEWEST_NS] = labels[slots[count - 2], STAMP_NS]
+    for j in range(index, count - 1):
+        slot = slots[j]
+        predict_at(kind, noise, track, j, smoothing[0])
+        innovate(kind, steps[slot, 0], track, slot, innovation, H)
+        if not correct_slot(kind, track, slot, innovation, H, correction):
+            return False
+    return True
+
+
 @njit(f"int64({BANK}, int64[::1], {TIMES_NS}, {STACK})")
 def insert(bank: Bank, tracks: IntArray, times_ns: Times, stack: Stack) -> int:
     """Insert the first measurement of `stack` into the steps of the first of `tracks`. See `insert_step`.
