@@ -173,13 +173,19 @@ class DecidedTracker(MultiObjectTracker):
 
     def _follow(self, entry: Entry, changes: Sequence[Explained]) -> None:
         """Let the estimators follow the decisions, and record the detections of `entry`."""
-        named = self._named(changes)
-        self._revise(entry, changes, named)
+        again: set[int] = set()
+        named = self._named(changes, again)
+        self._revise(entry, changes, named, again)
         self._update_lives(entry.batch.stamp_ns)
         self._record(entry)
 
-    def _named(self, changes: Sequence[Explained]) -> list[list[int | None]]:
-        """Return the public track of each candidate of the changed lists. New tracks get numbers."""
+    def _named(
+        self, changes: Sequence[Explained], again: set[int]
+    ) -> list[list[int | None]]:
+        """Return the public track of each candidate of the changed lists. New tracks get numbers.
+
+        A track with another first detection than before keeps its number, and is added to `again`.
+        """
         unknown: dict[int, Counter[int]] = {}
         for each in changes:
             for root, old in zip(each.taken, self._of[each.entry.number], strict=True):
@@ -194,6 +200,7 @@ class DecidedTracker(MultiObjectTracker):
                     if self._roots.get(public) not in present:
                         self._public.pop(self._roots.get(public, NONE), None)
                         self._public[root], self._roots[public] = public, root
+                        again.add(public)
                         break
         named: list[list[int | None]] = []
         for each in changes:
@@ -230,9 +237,9 @@ class DecidedTracker(MultiObjectTracker):
         entry: Entry,
         changes: Sequence[Explained],
         named: Sequence[list[int | None]],
+        again: set[int],
     ) -> None:
-        """Publish the decisions. Estimate the tracks whose detections have changed once more."""
-        again: set[int] = set()
+        """Publish the decisions. Estimate tracks once more whose detections have changed, and those in `again`."""
         lost: list[tuple[Entry, int, int]] = []
         won: list[tuple[Entry, int, int]] = []
         added: list[tuple[Entry, list[int]]] = []

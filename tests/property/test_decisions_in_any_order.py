@@ -9,7 +9,12 @@ import pytest
 
 from fgtrack import Config, Detection, DetectionList, FloatArray
 from fgtrack.core.state import from_bytes, to_bytes
-from fgtrack.core.types import Disposition, FinalTrack, Revision, UpdateRecord
+from fgtrack.core.types import (
+    Disposition,
+    FinalTrack,
+    Revision,
+    UpdateRecord,
+)
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.tracking.tracker_state import TrackerState
 
@@ -84,7 +89,7 @@ class Outcome:
     """What a tracker has found."""
 
     states: list[tuple[float, ...]]
-    """Present states and covariances, sorted."""
+    """Present states and covariances of all tracks that no time alone may have ended, sorted."""
     tracks: list[FinalTrack]
     records: list[UpdateRecord]
     revisions: list[Revision]
@@ -132,6 +137,7 @@ def outcome(lists: Lists, delays_ns: Sequence[int], config: Config) -> Outcome:
     states = sorted(
         (*each.state.mean.tolist(), *each.state.covariance.ravel().tolist())
         for each in tracker.tracks_at(round(LENGTH_S * SECOND))
+        if (each.score or 0.0) > 0.02
     )
     tracker.finish()
     return Outcome(states, tracker.final_tracks(), records, revisions)
