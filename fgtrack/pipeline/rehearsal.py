@@ -14,6 +14,7 @@ import numpy as np
 
 from fgtrack.config.settings import Config
 from fgtrack.core.geometry import body_point, wrap_angle
+from fgtrack.core.linalg import inverse_root
 from fgtrack.core.time import NS_PER_S, nanoseconds, period_ns, seconds
 from fgtrack.core.types import FRAMES, Detection, DetectionList, EgoState, Frame
 from fgtrack.models.sensors import SensorModel
@@ -44,6 +45,7 @@ def rehearse(config: Config) -> None:
     if digest in _rehearsed:
         return
     _LOG.info("loading and compiling what a tick needs")
+    inverse_root(np.eye(1))  # LAPACK, which some estimators need in rare ticks only
     tracker = build_tracker(config)
     for tick in clock_ticks(_messages(config), config.clock.node_hz):
         for message in tick.messages:

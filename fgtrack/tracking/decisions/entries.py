@@ -10,6 +10,7 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, Detection, EgoState, FloatArray
 from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import CT, MotionModel
@@ -129,12 +130,24 @@ class Entry:
     """Number of the list in the order of arrival."""
 
     _starts: dict[int, Start | None] = field(default_factory=dict)
+    _states: dict[int, tuple[FloatArray, FloatArray] | None] = field(
+        default_factory=dict
+    )
 
     def start(self, position: int) -> Start | None:
         """Return the first state of the track that a candidate would start; None without one."""
         if position not in self._starts:
             self._starts[position] = self.starts.of(self.candidates[position])
         return self._starts[position]
+
+    def state(self, position: int) -> tuple[FloatArray, FloatArray] | None:
+        """Return mean and covariance of `start` in the state of the motion model of decisions; None without one."""
+        if position not in self._states:
+            start = self.start(position)
+            self._states[position] = (
+                None if start is None else initial_state(self.motion, start)
+            )
+        return self._states[position]
 
     @cached_property
     def key(self) -> tuple[int, str, bytes]:

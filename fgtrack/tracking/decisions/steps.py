@@ -21,7 +21,6 @@ from fgtrack.core.linalg import kernels, stacked
 from fgtrack.core.time import seconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
-from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import propagated
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import compiled_form
@@ -695,12 +694,8 @@ def _new(
     n, dim = len(columns), rules.motion.dim
     means, P = np.zeros((n, dim)), np.zeros((n, dim, dim))
     for k, column in enumerate(columns):
-        start = entry.start(column) if rules.prior is None else None
-        means[k], P[k] = (
-            _first_state(entry, column, unseen)
-            if start is None
-            else initial_state(rules.motion, start)
-        )
+        state = entry.state(column) if rules.prior is None else None
+        means[k], P[k] = _first_state(entry, column, unseen) if state is None else state
     visible = np.full((n, num_sensors), rules.visible_share)
     visible[:, entry.index] = 1.0
     return Nodes(
