@@ -147,7 +147,7 @@ class _Scene:
     ) -> DetectionList:
         """Return the list `k` of a sensor, which is the first one to detect the objects of the row `first` on.
 
-        Every fourth list comes after the next four, also one with objects that no other list has shown. One list is
+        Every fourth list comes after the next four lists. A late list may show objects for the first time. One list is
         too old.
         """
         late_ns = nanoseconds(min(0.2, sensor.max_delay_s or 0.2)) if k % 4 == 2 else 0

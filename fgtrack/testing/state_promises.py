@@ -114,7 +114,7 @@ def keeps_all_that_it_accepts_and_nothing_else(
 def gives_the_estimate_of_the_time_order_in_any_order(
     subject: Subject, stream: Stream
 ) -> None:
-    """Require the same states for two orders of arrival: that of the stream, and that of the stamps.
+    """Require the same states for two orders of arrival: the order of the stream, and the order of the stamps.
 
     In the second order, measurements with equal stamps are reversed, because their order must not matter either.
     """

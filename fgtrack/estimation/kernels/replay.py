@@ -190,8 +190,7 @@ def withdraw(
 ) -> bool:
     """Take the step at `index` out of the first of `tracks`, and re-filter the later measurements without it.
 
-    False if a later measurement can no longer be fused; the states are then those of the other measurements as far as
-    this measurement.
+    False if a later measurement can no longer be fused. The states from this later measurement on are then invalid.
     """
     n = bank[2].shape[3]
     check_noise(kind, noise, n)

@@ -27,6 +27,7 @@ from fgtrack.models.robust import compiled_form
 from fgtrack.tracking.association import near, reaches_m
 from fgtrack.tracking.decisions.entries import NOTHING, Description, Entry
 from fgtrack.tracking.decisions.ranking import LARGEST_LOSS, best_assignments
+from fgtrack.tracking.lives.existence import densities
 from fgtrack.tracking.lives.latency import Views
 from fgtrack.tracking.objects import differ
 from fgtrack.tracking.preprocess import Group
@@ -37,7 +38,7 @@ _LEAST_GAIN = -LARGEST_LOSS
 _LEAST_UNSEEN = 1e-5
 NONE = -1
 _HULL_STD_MPS = 0.5
-"""Velocity of one end of a hull against the other end, when the hull turns."""
+"""Standard deviation of the velocity between both ends of a hull that turns."""
 
 
 @dataclass(frozen=True)
@@ -350,9 +351,11 @@ def second_returns(
     ] * entry.sensor.detection_probability
     y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
     P = nodes.covariances[rows][:, :2, :2] + own.std_m**2 * np.eye(2)
-    nis = np.einsum("mti,tij,mtj->mt", y_m, np.linalg.inv(P), y_m)
-    densities = np.exp(-0.5 * nis) / (math.tau * np.sqrt(np.linalg.det(P)))
-    return np.asarray(np.where(entry.placed, own.share * densities @ detected, 0.0))
+    m, t = y_m.shape[:2]
+    spreads = np.tile(P, (m, 1, 1))
+    found = densities(y_m.reshape(-1, 2), spreads, np.zeros(spreads.shape))
+    returned = own.share * found.reshape(m, t) @ detected
+    return np.asarray(np.where(entry.placed, returned, 0.0))
 
 
 def _free(
@@ -871,5 +874,5 @@ def _own(nodes: Nodes, rows: IntArray, rules: Rules) -> FloatArray:
 
 def _log_normal(x: FloatArray, P: FloatArray) -> FloatArray:
     """Return log N(x; 0, P) of vectors (m, 2) with covariances (m, 2, 2), shape (m,)."""
-    nis = np.einsum("mi,mij,mj->m", x, np.linalg.inv(P), x)
-    return np.asarray(-0.5 * (nis + np.log(np.linalg.det(P))) - math.log(math.tau))
+    own = densities(np.ascontiguousarray(x), P, np.zeros(P.shape))
+    return np.asarray(np.log(np.maximum(own, 1e-300)))
