@@ -18,6 +18,7 @@ from fgtrack.evaluation.scores.continuity import (
     times_to_confirm,
     tracked_visits,
 )
+from fgtrack.evaluation.scores.decisions import DecisionMetrics, decision_metrics
 from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
     Consistency,
@@ -33,6 +34,7 @@ from fgtrack.evaluation.scores.multi_object import (
     multi_object_metrics,
 )
 from fgtrack.evaluation.scores.prediction import PredictionErrors, prediction_errors
+from fgtrack.evaluation.scores.revisions import RevisionMetrics, revision_metrics
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.runs import NO_TRACK, Columns, Run
@@ -137,12 +139,16 @@ class Metrics:
     time_per_detection_s: float
     """Wall time per received detection; NaN without detections."""
     consistency: Consistency
+    revisions: RevisionMetrics = field(default_factory=RevisionMetrics)
+    """Decisions and states that were taken back, see `revision_metrics`."""
     truth: TruthMetrics | None = None
     """Metrics with truth; None for a run without truth."""
     lagged: tuple[LagMetrics, ...] = ()
     """Errors of present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
     """GOSPA, CLEAR, IDF1 and HOTA; None without truth, or if the options exclude them."""
+    decisions: DecisionMetrics | None = None
+    """Parts of wrong decisions and of estimates in the errors; None without truth, or without `detections.csv`."""
     predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(
         default_factory=dict
     )
@@ -214,11 +220,13 @@ def evaluate_matched(
         if len(time_s)
         else math.nan,
         consistency=consistency(run, matching),
+        revisions=revision_metrics(run, options),
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
         multi_object=None
         if scored is None
         else multi_object_metrics(scored, options.gate_m),
+        decisions=decision_metrics(run, matching, options),
         predictions=prediction_errors(run, matching),
         failures=dict(run.meta.get("failures") or {}),
         left_out=tuple(excluded_lines(run.meta)),

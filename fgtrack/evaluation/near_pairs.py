@@ -41,6 +41,11 @@ class NearPairs:
             distances_m=self.distances_m[chosen],
         )
 
+    def nearest(self) -> Self:
+        """Return the nearest pair of each row; the first object wins a tie."""
+        pairs = self.where(np.lexsort((self.objects, self.distances_m, self.rows)))
+        return pairs.where(np.unique(pairs.rows, return_index=True)[1])
+
     def check(self, needed_m: float) -> None:
         """Raise `ValueError` if pairs below `needed_m` may be missing."""
         if needed_m > self.limit_m:

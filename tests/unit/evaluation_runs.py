@@ -11,6 +11,8 @@ from fgtrack.core.types import (
     DetectionList,
     Disposition,
     EgoState,
+    FinalTrack,
+    Revision,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -116,6 +118,8 @@ def write_run(
     num_detections: Sequence[int] = (),
     ego: Iterable[EgoState] = (),
     detections: Iterable[DetectionList] = (),
+    revisions: Iterable[Revision] = (),
+    final_tracks: Iterable[FinalTrack] = (),
 ) -> Run:
     """A run with the `tracks` of every tick, and the `updates` and `smoothed` states by tick."""
     updates, smoothed = updates or {}, smoothed or {}
@@ -140,6 +144,7 @@ def write_run(
             duration = process_ns[tick] if tick < len(process_ns) else 1_000_000
             count = num_detections[tick] if tick < len(num_detections) else len(records)
             writer.write_tick(report, duration, count)
+        writer.write_decisions(revisions, final_tracks)
         writer.finish(meta or {"estimator": "smoother"})
     return load_run(path)
 

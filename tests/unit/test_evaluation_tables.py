@@ -35,6 +35,8 @@ TABLES = {
     "consistency": ("run", "of"),
     **{f"residuals_{sensor}": ("run",) for sensor in SENSORS},
     "dispositions": ("run", "sensor"),
+    "revisions": ("run",),
+    "decisions": ("run",),
 }
 
 
@@ -135,7 +137,8 @@ def test_a_table_is_a_data_frame_and_csv_and_json_give_its_numbers(
             if column not in (*table.keys, "estimator", "standing")
         ]
         assert all(frame[column].dtype.kind in "if" for column in numbers)
-        assert len(frame) >= len(ESTIMATORS)
+        # These runs lack the values of detections, so there are no decisions to judge.
+        assert len(frame) >= len(ESTIMATORS) or name == "decisions"
         read = list(csv.DictReader(io.StringIO(table.to_csv())))
         for column in numbers:
             np.testing.assert_array_equal(

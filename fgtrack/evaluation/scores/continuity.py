@@ -54,10 +54,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
         2.0 * gate_m,
     )
     first_ns = run.tables["truth"]["stamp_ns"].min()
-    near = near.where(near.distances_m <= gate_m)
-    # The nearest object of each row comes first.
-    near = near.where(np.lexsort((near.objects, near.distances_m, near.rows)))
-    near = near.where(np.unique(near.rows, return_index=True)[1])
+    near = near.where(near.distances_m <= gate_m).nearest()
     paired = matching.paired & confirmed(matching.tracks)
     detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near.rows] - first_ns)
     confirmed_ns = pd.Series(matching.now_ns[matching.tick_index[paired]] - first_ns)

@@ -11,6 +11,8 @@ from fgtrack.core.types import FloatArray, IntArray
 
 NORMAL_95 = 1.959963984540054
 """Half-width of the 95 % interval of a normal variable, in standard deviations."""
+CHI_SQUARE_2_95 = -2.0 * math.log(0.05)
+"""95 % quantile of the normalised square of two normal variables: the square of the 95 % ellipse."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from fgtrack.evaluation.runs import OneRun, evaluated
 from fgtrack.evaluation.scores.innovations import FEWEST, RESIDUAL_NAMES
 from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table, Tables, named
+from fgtrack.evaluation.tables.decisions import decisions_table, revisions_table
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
@@ -51,8 +52,8 @@ def compare(
     """Compare the metrics of `runs`: the `verdict`, and tables by name.
 
     The tables are `differences`, `tracking`, `multi_object`, `lag`, `consistency`,
-    `dispositions`, and `residuals_SENSOR` of every sensor. Runs of the same recording
-    are compared sample by sample. A path is a run folder, or a folder of run folders.
+    `dispositions`, `revisions`, `decisions`, and `residuals_SENSOR` of every sensor. Runs
+    of the same recording are compared sample by sample. A path is a run folder, or a folder of run folders.
     The keys of a mapping are labels. `streaming` also evaluates published states at the
     time when they were ready.
 
@@ -76,6 +77,8 @@ def compare(
             for name in item.sensors
         },
         "dispositions": _dispositions(metrics),
+        "revisions": revisions_table(metrics),
+        "decisions": decisions_table(metrics),
     }
     more, sentences = streaming_tables(every) if streaming else ({}, [])
     details = {"runs": {label: item.as_dict() for label, item in metrics.items()}}
