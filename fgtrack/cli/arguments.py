@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from typer import Argument, Option
 
 from fgtrack.inputs.recording import Storage
-from fgtrack.runs import TableFormat
+from fgtrack.runs import TableFormat, TruthStorage
 
 Input = Annotated[
     Path,
@@ -55,6 +55,13 @@ TableFormatOption = Annotated[
     Option(
         "--format",
         help="Tables of the run folder: csv, or parquet (pyarrow) for hours.",
+    ),
+]
+TruthOption = Annotated[
+    TruthStorage | None,
+    Option(
+        "--truth",
+        help="Truth of the run: a copy, or only in the recording (a stream; default for parquet).",
     ),
 ]
 Form = Literal["md", "csv", "latex", "json"]

@@ -14,6 +14,7 @@ from fgtrack.cli.arguments import (
     Settings,
     TableFormatOption,
     TrackMap,
+    TruthOption,
 )
 from fgtrack.cli.show import progress, say, warn
 from fgtrack.config.reading import read_config
@@ -53,6 +54,7 @@ def replay(
     pit_map: PitMap = None,
     settings: Settings = None,
     table_format: TableFormatOption = "csv",
+    truth: TruthOption = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker.
@@ -81,6 +83,7 @@ def replay(
             ),
             overwrite=overwrite,
             table_format=table_format,
+            truth=truth,
         )
     for line in dict.fromkeys(
         str(replace(draft.config, estimator=name).effective) for name in names

@@ -54,6 +54,11 @@ class ClockConfig:
 
     node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
     """Ticks are at multiples of the node period; null: every message causes a tick."""
+    idle_ticks: bool = True
+    """False leaves out the ticks without a new list of detections, so a run has fewer rows.
+
+    The ego states of a tick without a list are then delivered with the next tick.
+    """
 
 
 @dataclass(frozen=True)

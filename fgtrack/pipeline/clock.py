@@ -35,6 +35,23 @@ def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterato
         next_ns = due_ns + step_ns
 
 
+def busy_ticks(ticks: Iterable[Tick]) -> Iterator[Tick]:
+    """Yield the ticks that deliver a list, and a last tick for the messages after the last list.
+
+    The messages of an omitted tick are delivered with the next tick. An empty list is a
+    list: it reports that no object was detected.
+    """
+    waiting: list[Delivered] = []
+    now_ns = 0
+    for now_ns, messages in ticks:
+        waiting += messages
+        if any(isinstance(message, DetectionList) for message in messages):
+            yield Tick(now_ns, waiting)
+            waiting = []
+    if waiting:
+        yield Tick(now_ns, waiting)
+
+
 def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
     """Yield each tick, with True for the last one."""
     before: Tick | None = None

@@ -17,7 +17,7 @@ from fgtrack.inputs.validation import InvalidMessageError, validated_message
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.simulation import simulated
-from fgtrack.runs import Run, TableFormat, load_run
+from fgtrack.runs import Run, TableFormat, TruthStorage, load_run
 from fgtrack.sim.scenario import Scenario
 
 
@@ -32,6 +32,7 @@ def replay(
     out: str | Path | None = None,
     overwrite: bool = False,
     table_format: TableFormat = "csv",
+    truth: TruthStorage | None = None,
 ) -> Run:
     """Replay a recording and return the run, which equals the run of the command `fgtrack replay`.
 
@@ -58,6 +59,9 @@ def replay(
         True to replace an existing run in `out`.
     table_format
         Format of the tables in `out`: `csv` or `parquet`.
+    truth
+        `copy` writes the truth into `out`. `recording` leaves it in the recording, an fgtrack stream. None copies it
+        into CSV tables, and leaves it in the recording for Parquet tables.
     """
     resolved = read_config(
         config, set, track_map=map, pit_map=pit_map, estimator=estimator
@@ -88,6 +92,7 @@ def replay(
             kind=kind,
             overwrite=overwrite,
             table_format=table_format,
+            truth=truth,
         )
         run = load_run(out)
     if (broken := run.meta["broken_off"]) is not None:

@@ -8,18 +8,27 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from time import perf_counter_ns
+from typing import get_args
 
-from fgtrack.config.settings import Config
+from fgtrack.config.settings import ClockConfig, Config
 from fgtrack.config.yaml_file import dump, plain
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TickReport, TruthState
 from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.formats import STREAM
 from fgtrack.meaning.assumed import assumed, is_open, source_of
 from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, with_last
-from fgtrack.runs import MemoryRun, Run, RunWriter, TableFormat, path_from_run
+from fgtrack.pipeline.clock import Delivered, Tick, busy_ticks, clock_ticks, with_last
+from fgtrack.runs import (
+    MemoryRun,
+    Run,
+    RunWriter,
+    TableFormat,
+    TruthStorage,
+    path_from_run,
+)
 from fgtrack.tracking.parts import TrackerParts, check_sensor
 from fgtrack.tracking.tracker import MultiObjectTracker
 
@@ -91,6 +100,7 @@ def replay(
     overwrite: bool = False,
     observed: Mapping[str, Callable[[TrackerParts], TrackerParts]] | None = None,
     table_format: TableFormat = "csv",
+    truth: TruthStorage | None = None,
 ) -> list[dict[str, object]]:
     """Run each estimator in `folders` over the messages into its run folder; return the contents of each meta.json.
 
@@ -98,10 +108,12 @@ def replay(
     the run ends there, and `broken_off` in the meta data contains the reason. `origin`
     and `kind` are path and format of the input. `observed` is the argument of
     `build_tracker`, by estimator. `table_format` is the format of the tables in the run
-    folders.
+    folders. `truth` is `copy` or `recording`, as in `truth_storage`.
 
-    Raises `DataError` for an input without messages for the tracker.
+    Raises `CallError` if the truth cannot stay in the recording, and `DataError` for an
+    input without messages for the tracker.
     """
+    storage = truth_storage(truth, table_format, kind)
     config = assumed(config, source_of(messages)).config
     with ExitStack() as stack:
         runs = []
@@ -109,12 +121,32 @@ def replay(
             chosen = replace(config, estimator=estimator)
             tracker = build_tracker(chosen, (observed or {}).get(estimator))
             head = _head(chosen, origin, kind, folder)
-            writer = RunWriter(folder, *head, overwrite, table_format)
+            writer = RunWriter(folder, *head, overwrite, table_format, storage)
             runs.append((chosen, tracker, stack.enter_context(writer)))
         return [
             _drive(tracker, messages(), chosen, writer, origin, on_tick)
             for chosen, tracker, writer in runs
         ]
+
+
+def truth_storage(
+    given: TruthStorage | None, table_format: TableFormat, kind: str
+) -> TruthStorage:
+    """Return where the truth of a run is: a `copy` in the run folder, or only in the `recording`.
+
+    The default is `recording` for Parquet tables of an fgtrack stream, and `copy`
+    otherwise. Raises `CallError` if the truth shall stay in a recording of another format.
+    """
+    if given is None:
+        return "recording" if (table_format, kind) == ("parquet", STREAM) else "copy"
+    if given == "recording" and kind != STREAM:
+        raise CallError(
+            f"truth: can stay only in an fgtrack stream, the recording is {kind!r}; give copy, "
+            "or make a stream with `fgtrack convert`"
+        )
+    if given not in get_args(TruthStorage):
+        raise CallError(f"truth: give copy or recording, not {given!r}")
+    return given
 
 
 def replay_in_memory(
@@ -179,7 +211,7 @@ def _drive(
                 writer.write_detections(message)
             yield message
 
-    for tick, is_last in with_last(clock_ticks(written(), config.clock.node_hz)):
+    for tick, is_last in with_last(_ticks(written(), config.clock)):
         before_ns = perf_counter_ns()
         for message in tick.messages:
             tracker.receive(message)
@@ -255,7 +287,13 @@ def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
         for message in Feed(messages, config)
         if not isinstance(message, TruthState)
     )
-    return clock_ticks(of_tracker, config.clock.node_hz)
+    return _ticks(of_tracker, config.clock)
+
+
+def _ticks(messages: Iterable[Delivered], clock: ClockConfig) -> Iterator[Tick]:
+    """Yield the ticks of `messages`, with or without the idle ticks."""
+    ticks = clock_ticks(messages, clock.node_hz)
+    return ticks if clock.idle_ticks else busy_ticks(ticks)
 
 
 @cache

@@ -14,6 +14,7 @@ from fgtrack.runs.timing import Node, ready_times
 from fgtrack.runs.writer import (
     RunWriter,
     TableFormat,
+    TruthStorage,
     check_run,
     digest,
     is_run_folder,
@@ -32,6 +33,7 @@ __all__ = [
     "Run",
     "RunWriter",
     "TableFormat",
+    "TruthStorage",
     "Columns",
     "check_run",
     "digest",

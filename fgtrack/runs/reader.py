@@ -18,8 +18,10 @@ from fgtrack.core.files import read_whole
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.yaml_text import safe_yaml
 from fgtrack.inputs.errors import one_line
+from fgtrack.inputs.settings import Origin
 from fgtrack.runs.columns import Columns
 from fgtrack.runs.csv_table import parse_csv, read_csv
+from fgtrack.runs.recorded_truth import RecordedTruth
 from fgtrack.runs.rows import text_header
 from fgtrack.runs.schema import (
     COLUMNS,
@@ -159,14 +161,7 @@ class Run:
     @property
     def recording(self) -> Path | None:
         """Path of the recording, relative to the run folder or as given; None if it does not exist."""
-        source = self.meta.get("input") or {}
-        given = [source["path"]] if source.get("path") else []
-        if self.path is not None and source.get("path_from_run"):
-            given.insert(0, self.path / str(source["path_from_run"]))
-        return next(
-            (path for path in map(Path, map(os.path.realpath, given)) if path.exists()),
-            None,
-        )
+        return recording_of(self.path, self.meta)
 
     def with_tables(self, **tables: Columns) -> "Run":
         """Return the run in which `tables` replace the tables of the same names. Its other tables stay."""
@@ -179,8 +174,15 @@ class Run:
         overwrite: bool = False,
         table_format: TableFormat = "csv",
     ) -> None:
-        """Write the run folder `path`; raises `CallError` if something exists there, as `RunWriter`."""
-        meta = {key: value for key, value in self.meta.items() if key != "tables"}
+        """Write the run folder `path`, with a copy of the truth.
+
+        Raises `CallError` if something exists there, as `RunWriter`.
+        """
+        meta = {
+            key: value
+            for key, value in self.meta.items()
+            if key not in ("tables", "truth")
+        }
         if self.recording is not None:
             meta["input"] = {
                 **meta["input"],
@@ -220,6 +222,11 @@ def load_run(path: Path | str) -> Run:
             f"{file}: does not contain format {RUN_FORMAT!r}, so this is not a run folder"
         )
     complete = bool(meta.get("complete"))
+    config_text = (
+        read_whole(config, LARGEST_META_MB).decode(errors="replace")
+        if complete or config.exists()
+        else ""
+    )
     table_format = meta.get("tables", "csv")
     if table_format not in get_args(TableFormat):
         raise DataError(
@@ -230,18 +237,33 @@ def load_run(path: Path | str) -> Run:
         name: _read_table(read, path / f"{name}.{table_format}", name, complete)
         for name in COLUMNS
     }
+    if isinstance(meta.get("truth"), dict):
+        recording = recording_of(path, meta)
+        tables["truth"] = RecordedTruth(
+            path, recording, meta, lambda: _origin(config_text)
+        )
     if (np.diff(tables["timing"]["tick"]) <= 0).any():
         raise DataError(
             f"{path}/timing.{table_format}: its ticks do not increase, repeat the run"
         )
-    has_config = complete or config.exists()
-    return Run(
-        path,
-        meta,
-        read_whole(config, LARGEST_META_MB).decode(errors="replace")
-        if has_config
-        else "",
-        tables,
+    return Run(path, meta, config_text, tables)
+
+
+def _origin(config_text: str) -> Origin | None:
+    """Return the origin of the map in a configuration; None if the first position of the recording is the origin."""
+    given = ((_cached_yaml(config_text) or {}).get("input") or {}).get("origin")
+    return None if given is None else Origin(**given)
+
+
+def recording_of(folder: Path | None, meta: Mapping[str, Any]) -> Path | None:
+    """Return the path of the recording, relative to the run folder or as given; None if it does not exist."""
+    source = meta.get("input") or {}
+    given = [source["path"]] if source.get("path") else []
+    if folder is not None and source.get("path_from_run"):
+        given.insert(0, folder / str(source["path_from_run"]))
+    return next(
+        (path for path in map(Path, map(os.path.realpath, given)) if path.exists()),
+        None,
     )
 
 

@@ -13,8 +13,10 @@ from typing import Literal, Protocol, Self, get_args
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.output import check_output, locked_folder, write_error, write_file
+from fgtrack.core.types import TruthState
 from fgtrack.runs.columns import Columns
 from fgtrack.runs.csv_table import CsvTable, csv_blocks
+from fgtrack.runs.recorded_truth import TruthHash
 from fgtrack.runs.rows import Row
 from fgtrack.runs.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.runs.sink import RunSink
@@ -29,6 +31,8 @@ _META = "meta.json"
 _STAGE = "new.part"
 TableFormat = Literal["csv", "parquet"]
 """Format of the tables of a run folder, and suffix of their files."""
+TruthStorage = Literal["copy", "recording"]
+"""Storage of the truth of a run: a copy in the run folder, or only in the recording."""
 _FILES = (
     *(f"{table}.{suffix}" for table in COLUMNS for suffix in get_args(TableFormat)),
     *("metrics.json", "config.yaml", _META),
@@ -56,6 +60,9 @@ class RunWriter(RunSink):
     `"complete": false`. An older run stays until `finish`: the new run is written into
     the subfolder `new.part`. Other files in the folder stay.
 
+    With the truth in the `recording`, the folder has no table `truth`: meta.json has the
+    number and the hash of its rows, and `load_run` reads them from the recording.
+
     Raises `CallError` for the format `parquet` without the package pyarrow.
     """
 
@@ -67,10 +74,12 @@ class RunWriter(RunSink):
         smoothed_lag_s: float | None = None,
         overwrite: bool = False,
         table_format: TableFormat = "csv",
+        truth: TruthStorage = "copy",
     ) -> None:
         super().__init__(config_text, meta, smoothed_lag_s)
         self._writer_of = table_writer(table_format)
         self._suffix = table_format
+        self._truth_hash = TruthHash() if truth == "recording" else None
         if table_format != "csv":
             self._meta["tables"] = table_format
         self.path = Path(path)
@@ -101,9 +110,18 @@ class RunWriter(RunSink):
         with suppress(OSError):  # a full disk was reported at the write
             self._open.close()
 
+    def write_truth(self, truth: TruthState) -> None:
+        """Add a row to the table `truth` or `ignored`, or count it where the truth stays in the recording."""
+        if self._truth_hash is None or truth.ignored:
+            super().write_truth(truth)
+        else:
+            self._truth_hash.add(truth)
+
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run as `RunSink.finish`, and replace an older run."""
         folder = self._begin()
+        if self._truth_hash is not None and self._truth_hash.num_rows:
+            meta = {**meta, "truth": self._truth_hash.as_meta()}
         finished = super().finish(meta)
         self._write_meta(folder)
         if folder != self.path:

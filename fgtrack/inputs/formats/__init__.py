@@ -7,6 +7,8 @@ Another name stands for a `FileFormat`, or for a function that returns a `FileFo
 
 from fgtrack.core.plugins import Registry
 
+STREAM = "stream"
+"""Name of the format of fgtrack streams."""
 _OBJECTS = "fgtrack.inputs.formats.objects"
 ADAPTERS = Registry(
     "adapter",
@@ -14,7 +16,7 @@ ADAPTERS = Registry(
         "fgtrack.adapters": {
             "csv": "fgtrack.inputs.formats.tables:FORMAT",
             "recording": "fgtrack.inputs.ros.topics:FORMAT",
-            "stream": "fgtrack.inputs.stream:FORMAT",
+            STREAM: "fgtrack.inputs.stream:FORMAT",
             "autoferry": "fgtrack.inputs.formats.autoferry:FORMAT",
             "fusiontracking": "fgtrack.inputs.formats.fusiontracking:FORMAT",
             "nuscenes": "fgtrack.inputs.formats.nuscenes:FORMAT",
