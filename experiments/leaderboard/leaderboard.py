@@ -23,6 +23,8 @@ OTHERS = (
     ("stonesoup", "stone_soup.py:Accumulated"),
     ("stonesoup", "stone_soup.py:AtArrival"),
     ("stonesoup", "stone_soup.py:Buffered"),
+    ("stonesoup", "stone_soup.py:InverseTime"),
+    ("stonesoup", "stone_soup.py:Particles"),
     ("pyrecest", "pyrecest_replay.py:Replay"),
     ("filterpy", "filterpy_lag.py:FixedLag"),
 )

@@ -66,11 +66,14 @@ def main(
     out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path(
         "out/comparison"
     ),
-    seeds: Annotated[int, typer.Option(help="Seeds 1 to this.")] = 8,
+    seeds: Annotated[int, typer.Option(help="Number of seeds, from 1.")] = 8,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
+    sweep: Annotated[
+        str, typer.Option(help="Sweep with the rows of the table.")
+    ] = "comparison",
 ) -> None:
     """Run the sweep, which resumes, and write comparison.md."""
-    text = table(fgtrack.sweep("comparison", out, num_seeds=seeds + 1, jobs=jobs))
+    text = table(fgtrack.sweep(sweep, out, num_seeds=seeds, jobs=jobs))
     (out / "comparison.md").write_text(text)
     print(text)
 

@@ -14,13 +14,7 @@ from itertools import count
 
 import numpy as np
 from scenes import (
-    APPEARANCES_PER_S,
-    BIRTH_MEAN,
-    BIRTH_STD,
-    CLUTTER_PER_M2,
-    DEATHS_PER_S,
-    DETECTION_PROBABILITY,
-    NOISE_M,
+    MODEL,
     Scene,
     Trajectory,
     transition,
@@ -30,8 +24,8 @@ from scipy.optimize import linear_sum_assignment
 from fgtrack import FloatArray
 
 _H = np.eye(2, 4)
-_R = NOISE_M**2 * np.eye(2)
-_BIRTH_COVARIANCE = np.diag(BIRTH_STD**2)
+_R = MODEL.std_m**2 * np.eye(2)
+_BIRTH_COVARIANCE = np.diag(np.square(MODEL.birth_std))
 _LEAST_EXISTENCE = 1e-4
 _LEAST_DENSITY = 1e-5
 _LEAST_WEIGHT = 1e-4
@@ -125,14 +119,16 @@ def hypotheses(
     for scan in scene.in_order().scans:
         dt_s = scan.stamp_s if before_s is None else scan.stamp_s - before_s
         before_s = scan.stamp_s
-        survival = math.exp(-DEATHS_PER_S * dt_s)
+        survival = math.exp(-MODEL.deaths_per_s * dt_s)
         unseen = [
             Unseen(each.number * survival, each.state.after(dt_s))
             for each in unseen
             if each.number > _LEAST_DENSITY
         ]
-        new = APPEARANCES_PER_S / DEATHS_PER_S * (1.0 - survival)
-        unseen.append(Unseen(new, Gaussian(BIRTH_MEAN, _BIRTH_COVARIANCE)))
+        new = MODEL.appearances_per_s / MODEL.deaths_per_s * (1.0 - survival)
+        unseen.append(
+            Unseen(new, Gaussian(np.array(MODEL.birth_mean), _BIRTH_COVARIANCE))
+        )
         born, log_new = _births(unseen, scan.stamp_s, scan.points_m)
         children = {
             node: _children(node, dt_s, survival, scan.stamp_s, scan.points_m)
@@ -140,7 +136,7 @@ def hypotheses(
         }
         kept = _best(kept, children, born, log_new, num_hypotheses)
         unseen = [
-            Unseen(each.number * (1.0 - DETECTION_PROBABILITY), each.state)
+            Unseen(each.number * (1.0 - MODEL.detection_probability), each.state)
             for each in unseen
         ]
         yield kept
@@ -152,12 +148,12 @@ def _births(
     """Return the new track of each point, and the log-density of a point without an old track, shape (n,)."""
     parts = np.array(
         [
-            each.number * DETECTION_PROBABILITY * each.state.densities(points_m)
+            each.number * MODEL.detection_probability * each.state.densities(points_m)
             for each in unseen
         ]
     )
     of_objects = parts.sum(axis=0)
-    total = of_objects + CLUTTER_PER_M2
+    total = of_objects + MODEL.clutter_per_m2
     born: list[Node | None] = []
     for index, point_m in enumerate(points_m):
         existed = float(of_objects[index] / total[index])
@@ -176,15 +172,15 @@ def _children(
     """Return log-likelihood and track of each possible detection by its index; None for a miss."""
     state = node.state.after(dt_s)
     alive = node.alive * survival
-    unseen = 1.0 - alive * DETECTION_PROBABILITY
-    missed = 1.0 - node.existed * alive * DETECTION_PROBABILITY
+    unseen = 1.0 - alive * MODEL.detection_probability
+    missed = 1.0 - node.existed * alive * MODEL.detection_probability
     children: dict[int | None, tuple[float, Node]] = {
         None: (
             math.log(missed),
             Node(
                 state,
                 node.existed * unseen / missed,
-                alive * (1.0 - DETECTION_PROBABILITY) / unseen,
+                alive * (1.0 - MODEL.detection_probability) / unseen,
                 None,
                 node,
                 node.prior,
@@ -195,7 +191,7 @@ def _children(
     if now > _LEAST_EXISTENCE:
         densities = state.densities(points_m)
         for index in np.flatnonzero(densities > 1e-8).tolist():
-            likelihood = now * DETECTION_PROBABILITY * float(densities[index])
+            likelihood = now * MODEL.detection_probability * float(densities[index])
             point_m = points_m[index]
             track = Node(
                 state.given(point_m), 1.0, 1.0, (stamp_s, point_m), node, node.prior

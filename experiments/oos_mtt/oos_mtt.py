@@ -16,14 +16,7 @@ import numpy as np
 import typer
 from hypotheses import trajectories
 from scenes import (
-    APPEARANCES_PER_S,
-    BIRTH_MEAN,
-    BIRTH_STD,
-    CLUTTER_PER_M2,
-    DEATHS_PER_S,
-    DENSITY_M2PS3,
-    DETECTION_PROBABILITY,
-    NOISE_M,
+    MODEL,
     SENSOR,
     Scene,
     Trajectory,
@@ -58,9 +51,9 @@ def configuration(estimator: str) -> Config:
             "estimator": estimator,
             "sensors": {
                 SENSOR: {
-                    "std": {"x_m": NOISE_M, "y_m": NOISE_M},
-                    "detection_probability": DETECTION_PROBABILITY,
-                    "clutter_per_m2": CLUTTER_PER_M2,
+                    "std": {"x_m": MODEL.std_m, "y_m": MODEL.std_m},
+                    "detection_probability": MODEL.detection_probability,
+                    "clutter_per_m2": MODEL.clutter_per_m2,
                     "field_of_view_rad": 2.0 * np.pi,
                     "max_delay_s": LONGEST_S,
                 }
@@ -68,17 +61,17 @@ def configuration(estimator: str) -> Config:
             "clock": {"node_hz": None},
             "motion": {
                 "kind": "cv",
-                "std_per_s": {"velocity": 10.0 * DENSITY_M2PS3**0.5},
+                "std_per_s": {"velocity": 10.0 * MODEL.acceleration_density_m2ps3**0.5},
             },
             "association": {"kind": "hypotheses", "most": NUM_HYPOTHESES},
             "birth": {
-                "appearances_per_s": APPEARANCES_PER_S,
-                "mean": dict(zip(CARTESIAN, BIRTH_MEAN.tolist(), strict=True)),
-                "std": dict(zip(CARTESIAN, BIRTH_STD.tolist(), strict=True)),
+                "appearances_per_s": MODEL.appearances_per_s,
+                "mean": dict(zip(CARTESIAN, MODEL.birth_mean, strict=True)),
+                "std": dict(zip(CARTESIAN, MODEL.birth_std, strict=True)),
             },
             "lifecycle": {
                 "delete_probability": 1e-4,
-                "lifetime_s": 1.0 / DEATHS_PER_S,
+                "lifetime_s": 1.0 / MODEL.deaths_per_s,
                 "visible_share": 0.99,
                 "out_of_view_s": LONGEST_S,
                 "hidden_s": LONGEST_S,

@@ -10,21 +10,11 @@ import numpy as np
 
 from fgtrack import NS_PER_S, Detection, DetectionList, FloatArray
 from fgtrack.evaluation import Scenes, t_gospa
+from fgtrack.sim import LATE_SCANS, draw_late_scans
 
 SENSOR = "sensor"
-NOISE_M = 2.0
-"""Standard deviation of a measured coordinate."""
-DETECTION_PROBABILITY = 0.9
-AREA_M = (800.0, 400.0)
-FALSE_PER_SCAN = 10.0
-CLUTTER_PER_M2 = FALSE_PER_SCAN / (AREA_M[0] * AREA_M[1])
-DENSITY_M2PS3 = 0.2
-"""Density of the white noise of the acceleration."""
-APPEARANCES_PER_S = 0.12
-DEATHS_PER_S = 0.02
-BIRTH_MEAN = np.array([200.0, 250.0, 3.0, 0.0])
-"""Mean x, y in m, and velocity in m/s, of an object that appears."""
-BIRTH_STD = np.array([50.0, 50.0, 1.0, 1.0])
+MODEL = LATE_SCANS
+"""Model of the scenes."""
 C_M = 10.0
 SWITCH_M = 1.0
 """Cut-off distance and cost of a switch of the metric."""
@@ -137,67 +127,23 @@ def squared_per_scan(
 
 def draw_scene(rng: np.random.Generator, num_scans: int = 120) -> Scene:
     """Draw a scene of the benchmark's model."""
-    stamps_s = np.cumsum(rng.exponential(1.0, num_scans))
-    born_s = [
-        *np.zeros(rng.poisson(APPEARANCES_PER_S * stamps_s[0])),
-        *rng.uniform(0.0, stamps_s[-1], rng.poisson(APPEARANCES_PER_S * stamps_s[-1])),
+    drawn = draw_late_scans(rng, num_scans)
+    stamps_s = drawn.stamps_s.tolist()
+    is_late = [k < last for k, last in zip(drawn.received, drawn.newest, strict=True)]
+    scans = [
+        Scan(stamps_s[k], drawn.points_m[k], late)
+        for k, late in zip(drawn.received, is_late, strict=True)
     ]
-    paths = [_path(rng, start_s, stamps_s) for start_s in born_s]
-    scans = [_points(rng, paths, k) for k in range(num_scans)]
-    order = np.arange(num_scans, dtype=np.float64)
-    order[4::5] += rng.poisson(1.0, len(order[4::5])) + 0.5
-    received = np.argsort(order, kind="stable").tolist()
-    newest = np.maximum.accumulate(received).tolist()
-    is_late = [k < last for k, last in zip(received, newest, strict=True)]
-    true_indices = sorted(
-        k for k, late in zip(received, is_late, strict=True) if not late
-    )
+    times_s = sorted(scan.stamp_s for scan in scans if not scan.is_late)
     truth = [
-        {
-            index: path[k, :2]
-            for index, k in enumerate(true_indices)
-            if np.isfinite(path[k, 0])
-        }
-        for path in paths
+        {index: path[time_s] for index, time_s in enumerate(times_s) if time_s in path}
+        for path in drawn.paths
     ]
-    return Scene(
-        tuple(
-            Scan(float(stamps_s[k]), scans[k], late)
-            for k, late in zip(received, is_late, strict=True)
-        ),
-        stamps_s[true_indices],
-        tuple(path for path in truth if path),
-    )
+    return Scene(tuple(scans), np.array(times_s), tuple(path for path in truth if path))
 
 
 def transition(dt_s: float) -> tuple[FloatArray, FloatArray]:
     """Return F and Q of x, y, vx, vy after `dt_s`."""
     forward = np.kron(np.array([[1.0, dt_s], [0.0, 1.0]]), np.eye(2))
     noise = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    return forward, DENSITY_M2PS3 * np.kron(noise, np.eye(2))
-
-
-def _path(rng: np.random.Generator, start_s: float, stamps_s: FloatArray) -> FloatArray:
-    """Draw the states of an object at the stamps, shape (n, 4); NaN where it does not exist."""
-    end_s = start_s + rng.exponential(1.0 / DEATHS_PER_S)
-    state = BIRTH_MEAN + BIRTH_STD * rng.standard_normal(4)
-    states = np.full((len(stamps_s), 4), np.nan)
-    before_s = start_s
-    for k in np.flatnonzero((stamps_s >= start_s) & (stamps_s < end_s)).tolist():
-        forward, noise = transition(stamps_s[k] - before_s)
-        spread = np.linalg.cholesky(noise + 1e-12 * np.eye(4))
-        state = forward @ state + spread @ rng.standard_normal(4)
-        states[k] = state
-        before_s = stamps_s[k]
-    return states
-
-
-def _points(rng: np.random.Generator, paths: list[FloatArray], k: int) -> FloatArray:
-    """Draw the measured positions of scan `k`, shape (n, 2), in random order."""
-    seen_m = [
-        path[k, :2] + NOISE_M * rng.standard_normal(2)
-        for path in paths
-        if np.isfinite(path[k, 0]) and rng.random() < DETECTION_PROBABILITY
-    ]
-    false_m = rng.uniform(0.0, AREA_M, (rng.poisson(FALSE_PER_SCAN), 2))
-    return rng.permutation(np.concatenate([np.reshape(seen_m, (-1, 2)), false_m]))
+    return forward, MODEL.acceleration_density_m2ps3 * np.kron(noise, np.eye(2))

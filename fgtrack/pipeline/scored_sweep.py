@@ -38,7 +38,7 @@ def sweep(
     out
         Folder of the tables.
     num_seeds
-        Number of leading seeds to run; None for all.
+        Number of seeds to run, the first of the sweep; None for all.
     jobs
         Number of processes; None for one per core.
 
@@ -47,9 +47,8 @@ def sweep(
     import pandas
 
     plan, folder = load_plan(find_file("sweep", name)), Path(out)
-    chosen = tuple(
-        job for job in plan.jobs if num_seeds is None or job.seed < num_seeds
-    )
+    leading = list(dict.fromkeys(job.seed for job in plan.jobs))[:num_seeds]
+    chosen = tuple(job for job in plan.jobs if job.seed in leading)
     for product in PRODUCTS:
         check_no_overlap(folder / product, plan.inputs)
     result = Sweep.open(replace(plan, jobs=chosen), folder).run(score, jobs=jobs or -1)

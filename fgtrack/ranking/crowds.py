@@ -16,11 +16,10 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.models.motion import CV
 from fgtrack.models.sensors import in_view
 from fgtrack.pipeline.public import simulate
+from fgtrack.sim.late_scans import LATE_SCANS, draw_late_scans
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.vehicles import draw_states
 
 CROWD_LAGS_S = (0.0, 1.0)
 """Times of the questions before the present."""
@@ -255,91 +254,46 @@ def _queries(
     )
 
 
-_AREA_M = (800.0, 400.0)
-_FALSE_PER_SCAN = 10.0
-_BIRTHS_PER_S, _DEATHS_PER_S = 0.12, 0.02
-_BIRTH_MEAN = np.array([200.0, 250.0, 3.0, 0.0])
-_BIRTH_STD = np.array([50.0, 50.0, 1.0, 1.0])
-_NUM_SCANS = 120
-
-
 def _late_scans(name: str, seed: int) -> CrowdProblem:
-    """Draw the benchmark of Garcia-Fernandez and Yi 2021: every fifth scan is late by a Poisson number of scans."""
-    rng = np.random.default_rng(seed)
-    motion = CV(velocity_density_m2ps3=0.2)
-    sensor = CrowdSensor(2.0, 0.9, _FALSE_PER_SCAN / (_AREA_M[0] * _AREA_M[1]))
+    """Draw the benchmark of Garcia-Fernandez and Yi 2021; a scan is received at the newest stamp so far."""
+    scene = draw_late_scans(np.random.default_rng(seed), lags_s=CROWD_LAGS_S)
     start_ns = NS_PER_S
-    stamps_s = np.cumsum(rng.exponential(1.0, _NUM_SCANS))
-    stamps_ns = [start_ns + nanoseconds(time_s) for time_s in stamps_s]
-    born_s = rng.uniform(0.0, stamps_s[-1], rng.poisson(_BIRTHS_PER_S * stamps_s[-1]))
-    lives = [(each, each + rng.exponential(1.0 / _DEATHS_PER_S)) for each in born_s]
-    asked_s = stamps_s[1:, None] - np.array(CROWD_LAGS_S)
-    times_s = np.unique([*stamps_s, *asked_s.ravel()])
-    paths = [_path(motion, life, times_s, rng) for life in lives]
-    points = [_detected(paths, time_s, sensor, rng) for time_s in stamps_s.tolist()]
-    order = np.arange(_NUM_SCANS, dtype=np.float64)
-    order[4::5] += rng.poisson(1.0, len(order[4::5])) + 0.5
-    received = np.argsort(order, kind="stable").tolist()
-    newest = np.maximum.accumulate(received).tolist()
+    stamps_ns = [start_ns + nanoseconds(time_s) for time_s in scene.stamps_s]
     scans = tuple(
-        Scan(stamps_ns[last], stamps_ns[k], "sensor", points[k], np.zeros(3))
-        for k, last in zip(received, newest, strict=True)
+        Scan(stamps_ns[last], stamps_ns[k], "sensor", scene.points_m[k], np.zeros(3))
+        for k, last in zip(scene.received, scene.newest, strict=True)
     )
-    moments = sorted({last for last in newest if last > 0})
     queries, truth = [], []
-    for k in moments:
-        num_known = 1 + max(n for n, last in enumerate(newest) if last == k)
+    for k in sorted(set(scene.newest) - {0}):
+        num_known = 1 + max(n for n, last in enumerate(scene.newest) if last == k)
         for lag_s in CROWD_LAGS_S:
-            time_s = float(stamps_s[k] - lag_s)
+            time_s = float(scene.stamps_s[k] - lag_s)
             if time_s < 0.0:
                 continue
-            queries.append(
-                CrowdQuery(num_known, stamps_ns[k] - nanoseconds(lag_s), lag_s)
-            )
+            stamp_ns = stamps_ns[k] - nanoseconds(lag_s)
+            queries.append(CrowdQuery(num_known, stamp_ns, lag_s))
             truth.append(
-                {n: path[time_s] for n, path in enumerate(paths) if time_s in path}
+                {
+                    n: path[time_s]
+                    for n, path in enumerate(scene.paths)
+                    if time_s in path
+                }
             )
     return CrowdProblem(
         name,
         start_ns,
         3.0,
-        0.2,
-        {"sensor": sensor},
+        LATE_SCANS.acceleration_density_m2ps3,
+        {"sensor": _SENSOR},
         scans,
         tuple(queries),
         tuple(truth),
     )
 
 
-def _path(
-    motion: CV,
-    life_s: tuple[float, float],
-    times_s: FloatArray,
-    rng: np.random.Generator,
-) -> dict[float, FloatArray]:
-    """Draw the positions of an object at the times between its birth and its death."""
-    state, before_s = _BIRTH_MEAN + _BIRTH_STD * rng.standard_normal(4), life_s[0]
-    found = {}
-    for time_s in times_s[(times_s > life_s[0]) & (times_s < life_s[1])].tolist():
-        state = draw_states(motion, state, time_s - before_s, rng)
-        found[time_s], before_s = state[:2], time_s
-    return found
-
-
-def _detected(
-    paths: Sequence[Mapping[float, FloatArray]],
-    time_s: float,
-    sensor: CrowdSensor,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Draw the measured positions of a scan in random order, shape (n, 2)."""
-    seen = [
-        path[time_s] + sensor.std_m * rng.standard_normal(2)
-        for path in paths
-        if time_s in path and rng.random() < sensor.detection_probability
-    ]
-    false = rng.uniform(0.0, _AREA_M, (rng.poisson(_FALSE_PER_SCAN), 2))
-    return rng.permutation(np.concatenate([np.reshape(seen, (-1, 2)), false]))
+_SENSOR = CrowdSensor(
+    LATE_SCANS.std_m, LATE_SCANS.detection_probability, LATE_SCANS.clutter_per_m2
+)
 
 
 CROWDS: Mapping[str, Crowd] = {

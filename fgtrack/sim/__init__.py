@@ -18,8 +18,11 @@ _HOMES = {
     "EgoMessages": "fgtrack.sim.scenario",
     "GammaDelay": "fgtrack.sim.delays",
     "JitterClock": "fgtrack.sim.clocks",
+    "LATE_SCANS": "fgtrack.sim.late_scans",
     "LIDAR_DELAY": "fgtrack.sim.delays",
     "LaneChange": "fgtrack.sim.vehicles",
+    "LateScans": "fgtrack.sim.late_scans",
+    "LateScansModel": "fgtrack.sim.late_scans",
     "LossyDelay": "fgtrack.sim.delays",
     "MarkovDelay": "fgtrack.sim.delays",
     "MarkovTimeDelay": "fgtrack.sim.delays",
@@ -35,6 +38,7 @@ _HOMES = {
     "UniformDelay": "fgtrack.sim.delays",
     "WaypointVehicle": "fgtrack.sim.roads",
     "draw_delays": "fgtrack.sim.delays",
+    "draw_late_scans": "fgtrack.sim.late_scans",
     "draw_states": "fgtrack.sim.vehicles",
     "redelay": "fgtrack.sim.new_delays",
     "restamped": "fgtrack.sim.new_delays",
@@ -58,6 +62,10 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.sim.delays import NoDelay as NoDelay
     from fgtrack.sim.delays import UniformDelay as UniformDelay
     from fgtrack.sim.delays import draw_delays as draw_delays
+    from fgtrack.sim.late_scans import LATE_SCANS as LATE_SCANS
+    from fgtrack.sim.late_scans import LateScans as LateScans
+    from fgtrack.sim.late_scans import LateScansModel as LateScansModel
+    from fgtrack.sim.late_scans import draw_late_scans as draw_late_scans
     from fgtrack.sim.new_delays import SensorDelays as SensorDelays
     from fgtrack.sim.new_delays import redelay as redelay
     from fgtrack.sim.new_delays import restamped as restamped

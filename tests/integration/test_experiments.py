@@ -102,6 +102,50 @@ def test_a_short_run_writes_its_table_and_prints_it(
         assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+SHORT_COMPARISON = """
+format: fgtrack-sweep/1
+scenario: default
+config: tuned
+duration_s: 3.0
+seeds: [1, 2]
+estimators: [drop, ekf-backward-forward, rewind-forget, ekf-replay, ekf-rts, smoother-banded]
+set: {map.track: oval, map.pit: oval, options.ekf-replay.lagged_s: 0.3}
+vary:
+  delays:
+    label: [late, none]
+    scenario.sensors.lidar_cluster.delay: [{kind: constant, delay_s: 0.2}, {kind: none}]
+"""
+
+
+def test_the_comparison_has_a_row_for_each_estimator_and_state(tmp_path: Path) -> None:
+    comparison = load("ledger", "comparison")
+    sweep = tmp_path / "short.yaml"
+    sweep.write_text(SHORT_COMPARISON, encoding="utf-8")
+    comparison.main(tmp_path / "out", seeds=2, sweep=str(sweep))
+    text = (tmp_path / "out/comparison.md").read_text(encoding="utf-8")
+    assert text.startswith("2 seeds\n")
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    errors = {
+        (row[0].strip("| "), row[1], row[2]): float(row[3].split()[0])
+        for row in rows[1:]
+    }
+    assert len(errors) == len(comparison.ROWS)
+    replay_m = errors["late", "`ekf-replay`", "now"]
+    assert errors["none", "`ekf-replay`", "now"] < replay_m
+    assert errors["late", "`drop`", "now"] > replay_m
+    smoothed_m = errors["late", "`smoother-banded`", "0.3 s ago"]
+    assert smoothed_m < errors["late", "`ekf-replay`", "0.3 s ago"]
+
+
+def test_published_examples_have_a_row_for_each_method(tmp_path: Path) -> None:
+    literature = load("literature")
+    literature.main(tmp_path, runs=2)
+    rows = (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()
+    assert [row.split("`")[1] for row in rows[2:]] == list(literature.METHODS)
+    columns = {len(row.split(" | ")) for row in (rows[0], *rows[2:])}
+    assert columns == {1 + 2 * len(literature.EXAMPLES)}
+
+
 # --- recordings of other people
 
 

@@ -1,9 +1,11 @@
 """The adapters of other packages for `fgtrack rank`: what is known of each package is found and named."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from fgtrack.ranking import scenarios
 from fgtrack.ranking.public import rank
 from fgtrack.ranking.result import EXACT, Result
 
@@ -56,6 +58,22 @@ def test_examples_of_stone_soup_for_late_data_are_named() -> None:
         assert "another order of arrival changes an estimate by" in result.sentence
 
 
+def test_a_pseudo_detection_of_stone_soup_does_not_move_its_object() -> None:
+    one, ten = results("stonesoup", "InverseTime", ("late-by-1", "late-by-10"))
+    assert ten.deviation > 3.0 * one.deviation > 1.0
+
+
+@pytest.mark.slow  # 256 particles
+def test_the_particles_of_stone_soup_depart_as_a_filter_that_drops_late_detections() -> (
+    None
+):
+    particles = results("stonesoup", "Particles", LATE)
+    dropping = rank(["drop"], LATE, num_runs=2).results
+    for own, other in zip(particles, dropping, strict=True):
+        assert own.deviation == pytest.approx(other.deviation, abs=1.0)
+    assert particles[0].deviation > 1.0
+
+
 @pytest.mark.slow
 def test_stone_soup_sorts_range_and_bearing() -> None:
     (result,) = results("stonesoup", "Sorted", ("range-bearing",))
@@ -70,6 +88,17 @@ def test_the_replay_of_pyrecest_departs_for_a_position_between_its_steps() -> No
     assert deviations[0] > 0.8
     assert "the present estimate departs by up to" in found[0].sentence
     assert "there is no estimate 0.3 s ago" in found[0].sentence
+
+
+@pytest.mark.slow  # PyRecEst takes seconds to import
+def test_the_departure_of_pyrecest_grows_with_the_way_to_the_prediction_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slow = [each.deviation for each in results("pyrecest", "Replay", LATE)]
+    monkeypatch.setattr(scenarios, "_START", replace(scenarios._START, speed_mps=24.0))
+    fast = [each.deviation for each in results("pyrecest", "Replay", LATE)]
+    for twice, once in zip(fast, slow, strict=True):
+        assert 1.4 < twice / once < 2.6
 
 
 def test_the_smoother_of_filterpy_has_no_door_for_late_data() -> None:

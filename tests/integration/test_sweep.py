@@ -507,3 +507,11 @@ def test_a_sweep_in_python_runs_the_first_seeds_and_then_those_that_are_left(
     assert sorted(every["seed"]) == [0, 0, 1, 1]
     again = every[every["seed"] == 0]
     assert again[metric].tolist() == first[metric].tolist()
+
+
+def test_the_first_seeds_of_a_list_are_counted_and_not_compared(tmp_path: Path) -> None:
+    sweep = write_sweep(
+        tmp_path, "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: [7, 3, 5]\n"
+    )
+    first = fgtrack.sweep(sweep, tmp_path / "out", num_seeds=2, jobs=1)
+    assert sorted(first["seed"]) == [3, 7]

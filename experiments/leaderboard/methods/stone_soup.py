@@ -10,17 +10,32 @@ from stonesoup.models.transition.linear import (
     ConstantVelocity,
 )
 from stonesoup.predictor.asd import ASDKalmanPredictor
-from stonesoup.predictor.kalman import ExtendedKalmanPredictor
+from stonesoup.predictor.kalman import (
+    ExtendedKalmanPredictor,
+    UnscentedKalmanPredictor,
+)
+from stonesoup.predictor.particle import ParticlePredictor
+from stonesoup.resampler.particle import ESSResampler
 from stonesoup.types.detection import Detection
 from stonesoup.types.hypothesis import SingleHypothesis
-from stonesoup.types.state import ASDGaussianState, GaussianState
+from stonesoup.types.numeric import Probability
+from stonesoup.types.particle import Particle
+from stonesoup.types.state import (
+    ASDGaussianState,
+    GaussianState,
+    ParticleState,
+    State,
+)
 from stonesoup.updater.asd import ASDKalmanUpdater
-from stonesoup.updater.kalman import ExtendedKalmanUpdater
+from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
+from stonesoup.updater.particle import ParticleUpdater
 
 EPOCH = datetime(2024, 1, 1)
 #: Stone Soup's order x, vx, y, vy of the states x, y, vx, vy, and back.
 ORDER = [0, 2, 1, 3]
 BUFFERED = 5
+#: Number of particles, their standard deviations after a late detection, and the seed: those of the example.
+NUM_PARTICLES, SPREAD, SEED = 256, np.diag([10.0, 1.0, 10.0, 1.0]), 1908
 
 
 def at(time_s):
@@ -108,6 +123,83 @@ class Buffered(_Filter):
             self.waiting.sort(key=lambda one: one.timestamp)
             self.state = self.fused(self.state, self.waiting.pop(0))
         self.waiting.append(detection(observation, observation.stamp_s))
+
+
+class InverseTime(_Filter):
+    """The example of inverse-time dynamics: a late detection becomes a pseudo-detection at the newest stamp.
+
+    The state behind the detection has no velocity, so its position does not move.
+    """
+
+    def __init__(self, given):
+        super().__init__(given)
+        self.predictor = UnscentedKalmanPredictor(transition_model(given))
+        self.updater = UnscentedKalmanUpdater(None)
+
+    def update(self, observation):
+        one = detection(observation, observation.stamp_s)
+        if one.timestamp < self.state.timestamp:
+            one = self.moved(one, self.state.timestamp)
+        self.state = self.fused(self.state, one)
+
+    def moved(self, one, timestamp):
+        model = one.measurement_model
+        if isinstance(model, LinearGaussian):
+            place = model.matrix().T @ one.state_vector
+        else:
+            place = model.inverse_function(one)
+        place = self.predictor.transition_model.function(
+            State(place), noise=False, time_interval=timestamp - one.timestamp
+        )
+        z = model.function(State(place), noise=False)
+        return Detection(z, timestamp=timestamp, measurement_model=model)
+
+
+class Particles:
+    """The example of a particle filter: the particles of a late detection enter the track before the newest ones.
+
+    The filter goes on from the newest ones, so a late detection has no effect on the present.
+    """
+
+    def __init__(self, given):
+        np.random.seed(SEED)  # noqa: NPY002 (Stone Soup draws from it)
+        self.given = given
+        self.predictor = ParticlePredictor(transition_model(given))
+        self.resampler = ESSResampler()
+        self.updater = ParticleUpdater(None, resampler=self.resampler)
+        P = given.covariance[np.ix_(ORDER, ORDER)]
+        self.state = self.drawn(given.mean[ORDER], P, EPOCH)
+        self.track = [self.state]
+
+    def drawn(self, mean, covariance, timestamp):
+        rng = np.random.default_rng(SEED)
+        samples = rng.multivariate_normal(mean, covariance, NUM_PARTICLES)
+        particles = [Particle(each[:, None], Probability(1.0)) for each in samples]
+        return ParticleState(None, particle_list=particles, timestamp=timestamp)
+
+    def update(self, observation):
+        one = detection(observation, observation.stamp_s)
+        is_late = one.timestamp <= self.track[-1].timestamp
+        before, state = len(self.track) - 1, self.state
+        if is_late:
+            gaps = [abs(each.timestamp - one.timestamp) for each in self.track]
+            before = int(np.argmin(gaps))
+            near = self.track[before]
+            mean = np.asarray(near.state_vector, float).mean(axis=1)
+            state = self.drawn(mean, SPREAD, near.timestamp)
+        predicted = self.predictor.predict(state, timestamp=one.timestamp)
+        updated = self.updater.update(SingleHypothesis(predicted, one))
+        self.track.insert(before + 1, updated)
+        newest = self.track[-1]
+        self.state = self.resampler.resample(newest) if is_late else newest
+
+    def state_at(self, time_s):
+        dt_s = time_s - (self.state.timestamp - EPOCH).total_seconds()
+        if dt_s < 0.0:
+            return None
+        F, Q = self.given.transition(dt_s)
+        x, P = answer(self.state.mean, self.state.covar)
+        return F @ x, F @ P @ F.T + Q
 
 
 class Accumulated:
