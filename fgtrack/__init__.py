@@ -50,6 +50,8 @@ _HOMES = {
     "Nis": "fgtrack.pipeline.health",
     "ObjectList": "fgtrack.inputs.formats.common",
     "Ranking": "fgtrack.ranking.result",
+    "Revised": "fgtrack.pipeline.health",
+    "Revision": "fgtrack.core.types",
     "RobustLoss": "fgtrack.models.sensors",
     "Run": "fgtrack.runs",
     "ScheduledMeasurement": "fgtrack.evaluation.bounds",
@@ -149,6 +151,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.core.types import FloatArray as FloatArray
     from fgtrack.core.types import IntArray as IntArray
     from fgtrack.core.types import Message as Message
+    from fgtrack.core.types import Revision as Revision
     from fgtrack.core.types import SmoothedReport as SmoothedReport
     from fgtrack.core.types import TickReport as TickReport
     from fgtrack.core.types import TrackReport as TrackReport
@@ -211,6 +214,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.health import HealthLimits as HealthLimits
     from fgtrack.pipeline.health import HealthState as HealthState
     from fgtrack.pipeline.health import Nis as Nis
+    from fgtrack.pipeline.health import Revised as Revised
     from fgtrack.pipeline.health import SensorHealth as SensorHealth
     from fgtrack.pipeline.live import Checkpoint as Checkpoint
     from fgtrack.pipeline.live import Lateness as Lateness

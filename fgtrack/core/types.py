@@ -218,6 +218,13 @@ class TrackReport:
     """Class and size; None if no detection reports any."""
     score: float | None = None
     """Existence probability (`lifecycle.kind: existence`); None for a lifecycle without probabilities."""
+    open_until_ns: int | None = None
+    """Time up to which late data may change the state, or the decisions behind it; None for a final state."""
+
+    @property
+    def is_final(self) -> bool:
+        """True if no late data can change the state, nor the decisions behind it."""
+        return self.open_until_ns is None
 
     @property
     def stamp_ns(self) -> int:
@@ -323,6 +330,8 @@ class TickReport:
     tracks: tuple[TrackReport, ...]
     updates: tuple[UpdateRecord, ...]
     smoothed: tuple[SmoothedReport, ...] = ()
+    revisions: tuple[Revision, ...] = ()
+    """Decisions about earlier detections that late data has changed in this tick."""
 
     @classmethod
     def made_later(
@@ -330,6 +339,7 @@ class TickReport:
         tick: int,
         now_ns: int,
         smoothed: Sequence[SmoothedReport],
+        revisions: Sequence[Revision] = (),
         **makers: Callable[[], Iterable[object]],
     ) -> Self:
         """Return a report with `tracks` and `updates` that their `makers` compute at the first access.
@@ -338,7 +348,11 @@ class TickReport:
         """
         report = object.__new__(cls)
         report.__dict__.update(
-            tick=tick, now_ns=now_ns, smoothed=tuple(smoothed), makers=makers
+            tick=tick,
+            now_ns=now_ns,
+            smoothed=tuple(smoothed),
+            revisions=tuple(revisions),
+            makers=makers,
         )
         return report
 

@@ -13,9 +13,11 @@ from fgtrack.core.diagnostic import EGO
 from fgtrack.core.settings import settings
 from fgtrack.core.state import Snapshot, Stateful, copied
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Disposition, UpdateRecord
+from fgtrack.core.types import Disposition, TickReport, UpdateRecord
 from fgtrack.tracking.lives.latency import NEWEST
 
+MINUTE_NS = 60 * NS_PER_S
+"""Time over which revisions are counted."""
 #: Probability that the mean NIS of a consistent sensor lies beyond its limits.
 _RARE = 1e-3
 
@@ -87,6 +89,21 @@ class SensorHealth:
 
 
 @dataclass(frozen=True, slots=True)
+class Revised:
+    """Decisions of the last minute that late data has changed."""
+
+    changes: int = 0
+    """Number of changes of a detection's track in the last minute."""
+    detections: int = 0
+    """Number of detections in the last minute."""
+
+    @property
+    def share(self) -> float:
+        """Number of changes over the number of detections; 0 without detections."""
+        return self.changes / self.detections if self.detections else 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """State of a tracker at its last tick."""
 
@@ -96,6 +113,8 @@ class Health:
     """Reasons of a state that is not `ok`; each begins with the sensor, `ego`, `ticks` or `clock`."""
     sensors: Mapping[str, SensorHealth]
     """By sensor, and under `ego` for the ego."""
+    revised: Revised
+    """Decisions of the last minute that late data has changed."""
 
 
 @dataclass
@@ -152,7 +171,7 @@ _FAILED = (Disposition.FAILED, Disposition.INVALID)
 class Watch(Stateful):
     """Collects receipts and the records of all ticks for the health of a tracker."""
 
-    STATE: ClassVar[tuple[str, ...]] = ("by_sensor", "_receipts_ns")
+    STATE: ClassVar[tuple[str, ...]] = ("by_sensor", "_receipts_ns", "_decided")
 
     def __init__(self, sensors: Iterable[str]) -> None:
         self.by_sensor = {name: Innovations() for name in (*sensors, EGO)}
@@ -160,6 +179,8 @@ class Watch(Stateful):
         self._receipts_ns = {
             name: deque[int](maxlen=_RECENT) for name in self.by_sensor
         }
+        self._decided = deque[tuple[int, int, int]]()
+        """Time, number of changes and number of detections of the ticks of the last minute that have any."""
 
     def received(self, name: str, receipt_ns: int) -> None:
         """Note a message of a sensor or of the ego."""
@@ -170,18 +191,29 @@ class Watch(Stateful):
         gaps_ns = np.diff(self._receipts_ns[name])
         return float(np.median(gaps_ns)) / NS_PER_S if len(gaps_ns) else 0.0
 
-    def add(self, records: Iterable[UpdateRecord]) -> None:
-        """Add the records of a tick; unknown sensors are left out."""
-        for record in records:
+    def add(self, report: TickReport) -> None:
+        """Add the records and revisions of a tick; records of unknown sensors are left out."""
+        for record in report.updates:
             of_sensor = self.by_sensor.get(record.sensor)
             if of_sensor is not None:
                 of_sensor.add(record)
+        changes, detections = len(report.revisions), len(report.updates)
+        if changes or detections:
+            self._decided.append((report.now_ns, changes, detections))
+        while self._decided and self._decided[0][0] <= report.now_ns - MINUTE_NS:
+            self._decided.popleft()
+
+    def revised(self) -> Revised:
+        """Return the decisions of the last minute that late data has changed."""
+        _, changes, detections = zip((0, 0, 0), *self._decided, strict=True)
+        return Revised(sum(changes), sum(detections))
 
     def restore(self, snapshot: Snapshot) -> None:
         """See `Stateful.restore`; the outcomes stay the same objects."""
         for name, of_sensor in self.by_sensor.items():
             of_sensor.restore(snapshot["by_sensor"][name])
         self._receipts_ns = copied(snapshot["_receipts_ns"])
+        self._decided = copied(snapshot["_decided"])
 
 
 def delay_limits_s(config: Config, sensor: str) -> dict[str, float]:
@@ -278,6 +310,7 @@ def overall(
     sensors: Mapping[str, SensorHealth],
     stale: Sequence[str],
     ticks: Sequence[str],
+    revised: Revised,
 ) -> Health:
     """Return the health of the tracker. `stale` has reasons to call it stale; `ticks` has reasons of its ticks."""
     own = [
@@ -285,4 +318,4 @@ def overall(
     ]
     reasons = (*stale, *ticks, *own)
     state = HealthState.DEGRADED if reasons else HealthState.OK
-    return Health(HealthState.STALE if stale else state, reasons, sensors)
+    return Health(HealthState.STALE if stale else state, reasons, sensors, revised)

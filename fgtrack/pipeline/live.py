@@ -30,6 +30,7 @@ from fgtrack.core.types import (
     DetectionList,
     Disposition,
     EgoState,
+    Revision,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -67,7 +68,7 @@ __all__ = ["Checkpoint", "Lateness", "TickTiming", "Tracker"]
 MOST_UNKNOWN = 100
 OTHERS = "other sensors"
 #: First bytes of a file of a saved tracker, with the version of its contents.
-_MAGIC = b"fgtrack tracker 2\n"
+_MAGIC = b"fgtrack tracker 3\n"
 #: Largest lead of a receipt before the tick; a larger lead comes from a wrong clock. After a smaller lead the tracker
 #: recovers by itself when the clock reaches the receipt.
 MOST_AHEAD_NS = 60 * NS_PER_S
@@ -163,6 +164,7 @@ class Tracker:
         "_refused",
         "_unknown",
         "_records",
+        "_revisions",
         "_counts",
         "_last",
         "_first_tick_ns",
@@ -199,6 +201,7 @@ class Tracker:
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
+        self._revisions: list[Revision] = []
         self._counts: dict[str, Counter[str]] = {}
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
@@ -373,7 +376,8 @@ class Tracker:
             }
             silent = {name for name in by_name if is_silent(sources[name], limits)}
             stale = self._stale(silent)
-            return overall(by_name, stale, list(self._late_ticks(limits)))
+            late_ticks = list(self._late_ticks(limits))
+            return overall(by_name, stale, late_ticks, self._watch.revised())
 
     def _stale(self, silent: Collection[str]) -> list[str]:
         """Return the reasons for which tracks are predictions alone; `silent` sources send nothing."""
@@ -559,26 +563,36 @@ class Tracker:
                 self._num_back = self._num_back + 1 if is_far else 0
                 if self._num_back < NUM_BACK:
                     self._refused["tick before the last one"] += 1
-                    return replace(self._last, updates=(), smoothed=())
+                    return replace(self._last, updates=(), smoothed=(), revisions=())
                 self._start_over(now_ns)
             begun_ns = perf_counter_ns()
             self._take_arrivals()
             self._deliver(now_ns)
             self._read_report()
             report = self._tracker.tick(now_ns)
+            number = self._last.tick + 1
             report = replace(
                 report,
-                tick=self._last.tick + 1,
+                tick=number,
                 updates=(*self._records, *report.updates),
+                revisions=tuple(
+                    replace(each, tick=number)
+                    for each in (*self._revisions, *report.revisions)
+                ),
             )
             counts = self._counts_plus(report.updates)
             # One statement, so that an interrupt comes before or after it.
-            self._counts, self._records, self._tracker.unread = counts, [], None
+            self._counts, self._records, self._revisions, self._tracker.unread = (
+                counts,
+                [],
+                [],
+                None,
+            )
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             misses = self._node.misses
             self._node.done_ns(now_ns, self._ticks_ns[-1])
             self._misses.append(self._node.misses > misses)
-            self._watch.add(report.updates)
+            self._watch.add(report)
             self._newest_id = max(self._newest_id, _newest_id(report.updates))
             self._num_back = 0
             if self._last.tick < 0:
@@ -620,7 +634,12 @@ class Tracker:
         report = self._tracker.unread
         if report is not None:
             records = [*self._records, *report.updates]
-            self._records, self._tracker.unread = records, None
+            revisions = [*self._revisions, *report.revisions]
+            self._records, self._revisions, self._tracker.unread = (
+                records,
+                revisions,
+                None,
+            )
 
     def checkpoint(self) -> Checkpoint:
         """Return a copy of all that changes, from which `restore` goes on with the same bits.

@@ -226,7 +226,7 @@ def _drive(
         )
         detections_received += num_detections
         writer.write_tick(report, process_ns, num_detections)
-        writer.write_decisions(tracker.revised())
+        writer.write_decisions(report.revisions)
         on_tick(report)
     if feed.last_receipt_ns is None:
         raise DataError(

@@ -65,6 +65,13 @@ class Publication:
         """Return a function that makes track reports. Status, probability and counters are fixed at this call."""
         parts = self._parts
         statuses, probabilities = parts.lifecycle.reported(track_ids)
+        horizon_ns = parts.bank.present_ns - parts.bank.window_start_ns
+        open_until_ns = [
+            each.stamp_ns + horizon_ns
+            if each.stamp_ns >= parts.bank.window_start_ns
+            else None
+            for each in states
+        ]
         num_measured = list(map(self._tracks.num_measured.__getitem__, track_ids))
         objects = parts.objects.reports(track_ids)
         return partial(
@@ -76,4 +83,5 @@ class Publication:
             num_measured,
             objects,
             probabilities,
+            open_until_ns,
         )

@@ -201,7 +201,12 @@ class MultiObjectTracker:
         tracks = self._publication.present()
         updates = partial(chain.from_iterable, self._records)
         report = TickReport.made_later(
-            self._tick, now_ns, smoothed, tracks=tracks, updates=updates
+            self._tick,
+            now_ns,
+            smoothed,
+            self.revised(),
+            tracks=tracks,
+            updates=updates,
         )
         self._records, self.unread = [], report
         return report
@@ -233,7 +238,7 @@ class MultiObjectTracker:
         return tuple(self._publication.smoothed())
 
     def revised(self) -> list[Revision]:
-        """Return the decisions that late data has changed since the last call. This tracker decides once."""
+        """Return the decisions that late data has changed since the last report or call. This tracker decides once."""
         return []
 
     def final_tracks(self) -> list[FinalTrack]:

@@ -131,8 +131,9 @@ def outcome(lists: Lists, delays_ns: Sequence[int], config: Config) -> Outcome:
         while at < len(messages) and messages[at].receipt_ns <= now_ns:
             tracker.receive(messages[at])
             at += 1
-        records += tracker.tick(now_ns).updates
-        revisions += tracker.revised()
+        report = tracker.tick(now_ns)
+        records += report.updates
+        revisions += report.revisions
     assert at == len(messages)
     states = sorted(
         (*each.state.mean.tolist(), *each.state.covariance.ravel().tolist())
