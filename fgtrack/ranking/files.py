@@ -127,11 +127,16 @@ def _answer(row: Mapping[str, str], line: int) -> Answer | None:
     return Answer(mean, covariance)
 
 
-def finite_number(text: str, name: str, line: int) -> float:
-    """Return the number in a cell of column `name`. Raises `ValueError` if it is no finite number."""
+def finite_number(text: str | None, name: str, line: int) -> float:
+    """Return the number in a cell of column `name`.
+
+    Raises `ValueError` if the row is too short (None), or the cell is no finite number.
+    """
+    if text is None:
+        raise ValueError(f"line {line}: {name} is missing")
     try:
         value = float(text)
-    except (TypeError, ValueError):
+    except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(f"line {line}: {name}: {text!r} is not a finite number")

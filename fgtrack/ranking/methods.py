@@ -261,8 +261,16 @@ class Program(Method):
                     timeout=_TIMEOUT_S,
                     check=False,
                 )
-            except (OSError, subprocess.TimeoutExpired) as error:
-                raise MethodError(one_line(str(error))) from error
+            except FileNotFoundError as error:
+                raise MethodError(
+                    "the interpreter in its first line (#!) does not exist"
+                ) from error
+            except OSError as error:
+                raise MethodError(
+                    f"it cannot be started: {error.strerror}; the first line of a script begins with #!"
+                ) from error
+            except subprocess.TimeoutExpired as error:
+                raise MethodError(f"it takes more than {_TIMEOUT_S:g} s") from error
             seconds = time.perf_counter() - started_s
             if done.returncode:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]

@@ -9,14 +9,14 @@ from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.ranking.judge import judge
 from fgtrack.ranking.methods import Method, Program, Shipped
-from fgtrack.ranking.python_file import PythonMethod, python_file
+from fgtrack.ranking.python_file import PythonMethod, python_file, python_module
 from fgtrack.ranking.result import Ranking
 from fgtrack.ranking.scenarios import SCENARIOS
 
 __all__ = ["Ranking", "rank"]
 
 MethodLike = str | Path | Callable[..., Any]
-"""Name of an estimator, path of a Python file or of a program, class, or function."""
+"""Name of an estimator, path of a Python file or of a program, `MODULE:NAME`, class, or function."""
 
 
 def rank(
@@ -38,9 +38,10 @@ def rank(
 
 
 def method(like: MethodLike) -> Method:
-    """Return the method that `like` describes. `FILE.py:NAME` is a class or a function of a Python file.
+    """Return the method that `like` describes.
 
-    Raises `CallError` for anything else.
+    `FILE.py:NAME` is a class or a function of a Python file, `MODULE:NAME` of an installed
+    module. Raises `CallError` for anything else.
     """
     if not isinstance(like, str | Path):
         return PythonMethod(getattr(like, "__name__", "method"), like)
@@ -54,5 +55,12 @@ def method(like: MethodLike) -> Method:
     if path.is_file() and os.access(path, os.X_OK):
         return Program(path)
     if path.is_file():
-        raise CallError(f"{text}: is neither a Python file nor an executable program")
+        raise CallError(
+            f"{text}: is neither a Python file nor an executable program; "
+            f"make a program executable: chmod +x {text}"
+        )
+    if path.suffix == ".py" or file.endswith(".py") or os.sep in text:
+        raise CallError(f"{text}: there is no such file")
+    if file:
+        return python_module(file, name)
     return Shipped(ESTIMATORS.resolve(text))

@@ -1,6 +1,8 @@
 """Methods in Python: classes with `update` and `state_at`, and functions `fuse`."""
 
+import importlib
 import importlib.util
+import inspect
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +16,14 @@ import numpy as np
 from fgtrack.core.errors import CallError, one_line
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.models.motion import MotionModel
+from fgtrack.models.measurement import measurement_model
+from fgtrack.models.motion import CV, MotionModel
 from fgtrack.ranking.crowds import CrowdProblem, CrowdSensor
 from fgtrack.ranking.methods import Answers, Method, MethodError, Tracks
 from fgtrack.ranking.problem import Answer, Problem
+
+_CARTESIAN = CV()
+"""Motion model with the state x, y, vx, vy."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,14 @@ class Observation:
     """Measured components, shape (k,)."""
     R: FloatArray
     """Covariance of `z`, shape (k, k)."""
+
+    def innovation(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return `z` minus its prediction from x, y, vx, vy, shape (k,), and the Jacobian of the prediction, (k, 4).
+
+        The difference of two bearings lies in (-pi, pi].
+        """
+        model = measurement_model(tuple(self.values), _CARTESIAN)
+        return model.linearised(self.z, np.asarray(x, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -117,7 +131,7 @@ class PythonMethod(Method):
                 if self._is_class
                 else self._at_once(problem)
             )
-        except NotImplementedError:
+        except (MethodError, NotImplementedError):
             raise
         except Exception as error:
             raise MethodError(
@@ -144,7 +158,7 @@ class PythonMethod(Method):
         started_s = time.process_time()
         try:
             found = self._scan_by_scan(problem)
-        except NotImplementedError:
+        except (MethodError, NotImplementedError):
             raise
         except Exception as error:
             raise MethodError(
@@ -153,7 +167,7 @@ class PythonMethod(Method):
         return Tracks(tuple(found), time.process_time() - started_s)
 
     def _scan_by_scan(self, problem: CrowdProblem) -> list[dict[int, FloatArray]]:
-        one = self._code(
+        one = self._made(
             GivenCrowd(
                 problem.speed_mps,
                 problem.acceleration_density_m2ps3,
@@ -184,8 +198,18 @@ class PythonMethod(Method):
             )
         return found
 
+    def _made(self, given: Given | GivenCrowd) -> Any:
+        """Return an object of the class. Raises `MethodError` if the class does not take `given`."""
+        try:
+            inspect.signature(self._code).bind(given)
+        except TypeError as error:
+            raise MethodError(
+                f"{self._code.__name__}: define __init__(self, given): {error}"
+            ) from error
+        return self._code(given)
+
     def _one_by_one(self, problem: Problem, refused: Counter[str]) -> list[Any]:
-        one = self._code(_given(problem))
+        one = self._made(_given(problem))
         observations = _observations(problem)
         found = []
         known = 0
@@ -234,6 +258,25 @@ def python_file(path: Path, wanted: str = "") -> PythonMethod:
             f"{path}: holds {', '.join(own)}: name one, for instance {path}:{next(iter(own))}"
         )
     return PythonMethod(path.stem, next(iter(own.values())))
+
+
+def python_module(module: str, wanted: str) -> PythonMethod:
+    """Return the class or function `wanted` of an installed module.
+
+    Raises `CallError` if the module cannot be imported, or has no such method.
+    """
+    try:
+        code = getattr(importlib.import_module(module), wanted, None)
+    except Exception as error:
+        raise _not_imported(module, error) from error
+    if not callable(code):
+        raise CallError(f"{module}: has no class or function {wanted}")
+    return PythonMethod(f"{module}.{wanted}", code)
+
+
+def _not_imported(what: object, error: Exception) -> CallError:
+    text = f"{type(error).__name__}: {one_line(str(error))}"
+    return CallError(f"{what}: cannot be imported: {text}")
 
 
 def _is_method(name: str, code: object) -> bool:
@@ -331,7 +374,5 @@ def _module(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise CallError(
-            f"{path}: cannot be imported: {type(error).__name__}: {one_line(str(error))}"
-        ) from error
+        raise _not_imported(path, error) from error
     return module

@@ -26,6 +26,7 @@ from fgtrack.ranking.scenarios import SCENARIOS, draw
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "rank.md").read_text(encoding="utf-8")
 ADAPTER, IN_PYTHON = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+(SHELL,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
 
 #: A Kalman filter that sorts all known measurements by their stamps.
 SORTED = """
@@ -57,11 +58,6 @@ class One:
     def __init__(self, given): pass
     def update(self, observation): pass
     def state_at(self, time_s): return [1.0]
-"""
-SHELL = """#!/bin/sh
-awk -F, 'NR == 1 { for (i = 1; i <= NF; i++) at[$i] = i; print "x_m,y_m,vx_mps,vy_mps"; next }
-$at["kind"] == "query" { print x "," y ",0,0"; next }
-{ x = $at["x_m"]; y = $at["y_m"] }' "$1" > "$2"
 """
 
 
@@ -123,6 +119,33 @@ def test_the_adapter_of_the_page_runs_and_departs(tmp_path: Path) -> None:
     result = rank(path)
     assert result.problem is None
     assert result.deviation > 1.0
+
+
+@pytest.mark.parametrize("scenario", ["range-bearing", "doppler"])
+def test_an_innovation_of_an_observation_is_that_of_the_extended_filter(
+    scenario: str,
+) -> None:
+    class Sorted:
+        def __init__(self, given: Any) -> None:
+            self.given, self.known = given, []  # type: ignore[var-annotated]
+
+        def update(self, observation: Any) -> None:
+            self.known.append(observation)
+
+        def state_at(self, time_s: float) -> Any:
+            x, P, now_s = self.given.mean, self.given.covariance, 0.0
+            for each in sorted(self.known, key=lambda each: each.stamp_s):
+                if each.stamp_s <= time_s:
+                    F, Q = self.given.transition(each.stamp_s - now_s)
+                    x, P, now_s = F @ x, F @ P @ F.T + Q, each.stamp_s
+                    y, H = each.innovation(x)
+                    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + each.R)
+                    x, P = x + K @ y, P - K @ H @ P
+            F, Q = self.given.transition(time_s - now_s)
+            return F @ x, F @ P @ F.T + Q
+
+    found, shipped = rank(Sorted, scenario), rank("ekf-replay", scenario)
+    np.testing.assert_allclose(found.deviations, shipped.deviations, atol=1e-9)
 
 
 def test_the_adapter_of_the_page_is_short() -> None:
@@ -269,6 +292,12 @@ def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
             "#!/bin/sh\nawk 'BEGIN { print \"x\"; while (i++ < 15) print 1 }' > $2\n",
             "states.csv: column 'x_m' is missing",
         ),
+        ("#!/bin/none\n", "the interpreter in its first line (#!) does not exist"),
+        ("nothing", "the first line of a script begins with #!"),
+        (
+            '#!/bin/sh\nawk \'BEGIN { print "x_m,y_m,vx_mps,vy_mps"; while (i++ < 15) print "1,2" }\' > $2\n',
+            "line 2: vx_mps is missing",
+        ),
         (
             "#!/bin/sh\necho x_m > $2\n",
             "15 rows are expected, one for each query, not 0",
@@ -284,11 +313,38 @@ def test_a_program_that_fails_has_one_clear_line(
     assert "\n" not in result.problem
 
 
+def test_a_method_may_be_in_an_installed_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(tmp_path / "own_methods.py", ADAPTER)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert method("own_methods:AtArrival").name == "own_methods.AtArrival"
+    with pytest.raises(CallError, match="own_methods: has no class or function Other"):
+        method("own_methods:Other")
+    with pytest.raises(CallError, match="no_module: cannot be imported"):
+        method("no_module:Other")
+
+
+def test_a_class_without_given_is_told_to_take_it() -> None:
+    class Bare:
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> None: ...
+
+    problem = rank(Bare).problem
+    assert (
+        problem == "Bare: define __init__(self, given): too many positional arguments"
+    )
+
+
 def test_a_file_without_a_method_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallError, match="define a class with update"):
         method(written(tmp_path / "empty.py", "x = 1\n"))
-    with pytest.raises(CallError, match="neither a Python file nor an executable"):
+    with pytest.raises(CallError, match="make a program executable: chmod"):
         method(written(tmp_path / "data.csv", "x\n"))
+    for missing in ("./none", "none.py", "none.py:One"):
+        with pytest.raises(CallError, match="there is no such file"):
+            method(missing)
     with pytest.raises(CallError, match="ekf-replay"):
         method("ekf-repaly")
 
