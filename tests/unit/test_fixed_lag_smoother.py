@@ -1,6 +1,7 @@
 """What a smoother promises of its window, its relinearisation and its outputs."""
 
 import copy
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -88,11 +89,7 @@ def test_a_sensor_that_is_not_linear_brings_the_thresholds_of_the_position() -> 
 
 
 class Counted(IncrementalSolver):
-    num_updates = num_covariances = 0
-
-    def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        Counted.num_covariances += 1
-        return super()._covariance(track, *numbers)
+    num_updates = 0
 
     def _update(self, *windows: IntArray) -> None:
         Counted.num_updates += 1
@@ -121,17 +118,36 @@ def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
     assert Counted.num_updates == 5
 
 
-def test_covariances_are_read_from_the_graph_once_until_something_is_fused() -> None:
-    smoother, Counted.num_covariances = one_of(CV(), Start(), CountedBank), 0
-    for k in (1, 2):
-        smoother.update(at(100 * k, 3.0 * k))
-        before = Counted.num_covariances
-        states = [
-            smoother.state_at(stamp_ms * MS)
-            for stamp_ms in (100 * k + 10, 100 * k + 30, 100 * k)
-        ]
-        assert Counted.num_covariances == before + 1
-        assert states[0].covariance[0, 0] > states[2].covariance[0, 0]
+@pytest.mark.parametrize("motion", [CV(), CTRV()])
+def test_the_covariances_of_a_window_are_those_of_gtsam(motion: MotionModel) -> None:
+    """With detections ahead, late, on a node and older than the window; of states and of neighbours."""
+    start, rng = Start(yaw_rad=0.4, speed_mps=12.0), np.random.default_rng(1)
+    smoother = one_of(motion, start, IncrementalBank, lag_s=0.6, ring_s=1.0)
+    assert isinstance(smoother.bank, IncrementalBank)
+    solver = smoother.bank.solver
+    assert isinstance(solver, IncrementalSolver)
+    n, compared = motion.dim, 0
+    for ms in (100, 300, 200, 200, 510, 500, 400, 700, 900, 150, 650, 1100):
+        x_m, y_m = rng.normal([0.011 * ms, 0.004 * ms], 0.3)
+        stamp_ns = ms * MS
+        smoother.update(Measurement.of(stamp_ns, x_m=x_m, y_m=y_m, std=STD))
+        stamps_ns = solver.nodes.window_stamps_ns(0)
+        solver.states_at(np.zeros(len(stamps_ns), dtype=np.int64), stamps_ns)
+        numbers = solver.nodes.window(0).tolist()
+        for left, right in pairwise(numbers):
+            A, P = solver.nodes.backs[left, :n, :n], solver.nodes.P[right]
+            assert_same_covariance(solver.nodes.P[left], solver.covariance(0, left))
+            assert_same_covariance(P, solver.covariance(0, right))
+            joint = np.block([[solver.nodes.P[left], A @ P], [P @ A.T, P]])
+            assert_same_covariance(joint, solver.covariance(0, left, right))
+            compared += 1
+    assert compared > 30
+
+
+def assert_same_covariance(found: FloatArray, expected: FloatArray) -> None:
+    """Entries differ by less than 1e-9 standard deviations of both components."""
+    stds = np.sqrt(np.diag(expected))
+    assert (np.abs(found - expected) / np.outer(stds, stds)).max() < 1e-9
 
 
 def test_an_object_that_is_never_seen_again_has_no_graph() -> None:

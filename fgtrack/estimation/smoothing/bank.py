@@ -349,6 +349,7 @@ class SmootherBank(Stateful):
                 )
             except Exception as error:
                 raise EstimatorError({track_id: error}, {}) from error
+        self.solver.forget(track)
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`. An object whose first stamp is after the present has its first state."""

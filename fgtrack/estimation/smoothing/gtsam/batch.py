@@ -6,15 +6,18 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
+from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.state import Snapshot
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.graph import window_graph
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
+from fgtrack.estimation.smoothing.node_arrays import KNOWN
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.models.motion import MotionModel
 
 
-class BatchSolver(IncrementalSolver):
+class BatchSolver(Solver):
     """Windows that Levenberg-Marquardt solves from their last estimates. A prior replaces the states that leave a
     window.
 
@@ -22,6 +25,12 @@ class BatchSolver(IncrementalSolver):
     """
 
     is_damped: ClassVar[bool] = True
+
+    def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
+        super().__init__(motion, settings)
+        self._graphs: dict[int, tuple[gtsam.NonlinearFactorGraph, gtsam.Values]] = {}
+        self._read = set[tuple[int, ...]]()
+        """Nodes, and pairs of nodes, whose covariances were read since the last solution."""
 
     def optimise(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
@@ -47,7 +56,7 @@ class BatchSolver(IncrementalSolver):
 
     def restore(self, snapshot: Snapshot) -> None:
         """See `Stateful.restore`. The graphs are made from the last estimates, but not solved."""
-        Solver.restore(self, snapshot)
+        super().restore(snapshot)
         self._graphs.clear()
         self._read.clear()
         for track, estimates in snapshot["estimates"].items():
@@ -55,6 +64,73 @@ class BatchSolver(IncrementalSolver):
             for number, estimate in estimates.items():
                 values.insert(number, estimate)
             self._graphs[track] = self._graph(track), values
+
+    def forget(self, track: int) -> None:
+        """See `Solver.forget`: the next solution starts from the linearisation points."""
+        self._graphs.pop(track, None)
+        self._read.clear()
+
+    def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
+        """See `Solver.solve`."""
+        nodes = self.nodes
+        self._read.clear()
+        first = nodes.first[tracks]
+        is_leaving = first < anchors
+        if is_leaving.any():
+            self._solve(
+                tracks[is_leaving],
+                first[is_leaving],
+                anchors[is_leaving],
+                is_partial=True,
+            )
+        nodes.first[tracks] = anchors
+        nodes.tracks[tracks, KNOWN] = anchors  # the states that were read last
+        try:
+            for track in tracks.tolist():
+                self._update(track)
+        except (RuntimeError, ValueError, IndexError) as error:
+            for track in tracks.tolist():
+                self.forget(track)
+            raise np.linalg.LinAlgError(
+                f"the graph cannot be solved ({error})"
+            ) from error
+
+    def smoothed(
+        self, tracks: IntArray, indices: IntArray, after_s: FloatArray
+    ) -> FloatArray:
+        """See `Solver.smoothed`. Inside the windows, means and covariances come from the graphs."""
+        nodes, n = self.nodes, self.motion.dim
+        rows = zip(
+            tracks.tolist(),
+            indices.tolist(),
+            nodes.first[tracks].tolist(),
+            after_s.tolist(),
+            strict=True,
+        )
+        for track, index, first, time_s in rows:
+            if track not in self._graphs:  # nothing was fused: the window has one node
+                continue
+            last = max(index, first)
+            numbers = tuple(
+                nodes.numbers[
+                    track, last - (time_s > 0.0 and index > first) : last + 1
+                ].tolist()
+            )
+            if numbers in self._read:
+                continue
+            P, (left, *right) = self._covariance(track, *numbers), numbers
+            self._read.add(numbers)
+            for number in right:
+                A = psd_solve(
+                    P[n:, n:], P[n:, :n]
+                ).T  # the left state, given this state
+                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
+                    A,
+                    nodes.step[left] - A.dot(nodes.step[number]),
+                )
+                nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
+            nodes.P[right[0] if right else left] = P[-n:, -n:]
+        return super().smoothed(tracks, indices, after_s)
 
     def _graph(self, track: int) -> gtsam.NonlinearFactorGraph:
         """Return the nonlinear factors of a window, with a prior that replaces the states that have left it."""
@@ -71,26 +147,30 @@ class BatchSolver(IncrementalSolver):
             [(number, each) for number in numbers for each in nodes.factors(number)],
         )
 
-    def _update(self, tracks: IntArray, starts: IntArray) -> None:
+    def _update(self, track: int) -> None:
+        """Solve the graph of a track, and write `step` of the nodes in its window.
+
+        Raises `RuntimeError`, `ValueError` or `IndexError` if this fails.
+        """
         nodes = self.nodes
-        for track in tracks.tolist():
-            numbers, graph = nodes.window(track).tolist(), self._graph(track)
-            values = gtsam.Values()
-            _, last = self._graphs.get(track, (None, values))
-            for number in numbers:
-                values.insert(
-                    number,
-                    last.atVector(number)
-                    if last.exists(number)
-                    else nodes.origin[number],
-                )
-            values = self.optimise(graph, values)
-            self._graphs[track] = graph, values
-            for number in numbers:
-                nodes.step[number] = values.atVector(number) - nodes.origin[number]
+        numbers, graph = nodes.window(track).tolist(), self._graph(track)
+        values = gtsam.Values()
+        _, last = self._graphs.get(track, (None, values))
+        for number in numbers:
+            values.insert(
+                number,
+                last.atVector(number) if last.exists(number) else nodes.origin[number],
+            )
+        values = self.optimise(graph, values)
+        self._graphs[track] = graph, values
+        for number in numbers:
+            nodes.step[number] = values.atVector(number) - nodes.origin[number]
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        """See `IncrementalSolver._covariance`; computed by one dense QR of the whole linearised window."""
+        """Return the joint covariance of one node, shape (n, n), or of two neighbours, shape (2 n, 2 n).
+
+        It is computed by one dense QR of the whole linearised window.
+        """
         graph, values = self._graphs[track]
         ordering, n = gtsam.Ordering(), self.motion.dim
         for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):

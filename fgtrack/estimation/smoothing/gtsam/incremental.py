@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import gtsam
 import numpy as np
 
-from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
+from fgtrack.core.linalg import inverse_root
 from fgtrack.core.state import Snapshot
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing import factor_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.node_arrays import CHANGED, KNOWN
+from fgtrack.estimation.smoothing.node_arrays import CHANGED
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -51,35 +50,43 @@ class _Graph:
         self,
         numbers: Sequence[int],
         num_leaving: int,
-        values: gtsam.Values,
-        first: int,
+        new: Sequence[int],
+        zero: FloatArray,
         changed: _Changed,
     ) -> FloatArray:
         """Return the states of the nodes `numbers` as one vector, without the first `num_leaving` nodes, which
         leave the graph.
 
-        The factors that have `changed` replace the factors of the same nodes, from index `first` on. `values`
-        are the values of new nodes.
+        The factors that have `changed` replace the factors of the same nodes. The `new` nodes get the value `zero`.
         """
-        factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
+        factors, order, values = (
+            gtsam.GaussianFactorGraph(),
+            gtsam.KeyGroupMap(),
+            gtsam.Values(),
+        )
         for factor in changed.values():
             factors.push_back(factor)
+        for number in new:
+            values.insert(number, zero)
+        first = min(map(numbers.index, changed.keys() - {_PRIOR}), default=0)
         if first and numbers[first] == self._newest:  # both nodes are in one clique
             first -= 1
         for group, number in enumerate(numbers[first:]):
             order.insert2(number, group)
-        removed = [slot for slot in map(self.slots.get, changed) if slot is not None]
+        slots = self.slots
+        removed = [slot for slot in map(slots.get, changed) if slot is not None]
         graph = gtsam.LinearContainerFactor.ConvertLinearGraph(
             factors
         )  # faster than one by one
         added = self.isam.update(graph, values, removed, order).getNewFactorsIndices()
-        self.slots.update(zip(changed, added, strict=False))
+        slots.update(dict.fromkeys(new))
+        slots.update(zip(changed, added, strict=False))
         self._newest = numbers[-1]
         if num_leaving:
             leaves = gtsam.KeyList()
             for number in numbers[:num_leaving]:
                 leaves.push_back(number)
-                del self.slots[number]
+                del slots[number]
             self.isam.marginalizeLeaves(leaves)
         return self.isam.getDelta().vector(numbers[num_leaving:])
 
@@ -87,105 +94,65 @@ class _Graph:
 class IncrementalSolver(Solver):
     """Windows that iSAM2 solves. A compiled loop linearises the factors of all tracks.
 
-    Each track has its own factor graph, which gives means and covariances. States that leave the graph are kept as
-    in `Solver`. A track has no graph before its first fusion, because most tracks of clutter end before it.
+    Each track has its own factor graph, which gives the means of its window. The covariances come from the elimination
+    of `Solver`, which takes the same linearised factors of all tracks at once. A track has no graph before its first
+    fusion, because most tracks of clutter end before it.
     """
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
-        self._graphs: dict[int, Any] = {}  # Any: a subclass has its own type
-        self._read = set[tuple[int, ...]]()
-        """Nodes, and pairs of nodes, whose covariances were read since the last solution."""
+        self._graphs: dict[int, _Graph] = {}
 
     def checkpoint(self) -> Snapshot:
         """See `Stateful.checkpoint`. Graphs are not copied: the checkpoint only names the windows that have a
         graph.
+
+        iSAM2 cannot be copied, so the running solver also makes its graphs again. Then it goes on with the same bits as
+        a restored solver. Its states change by rounding: less than 1e-9 standard deviations.
         """
+        self._make_again(tuple(self._graphs))
         return {**super().checkpoint(), "solved": tuple(self._graphs)}
 
     def restore(self, snapshot: Snapshot) -> None:
-        """See `Stateful.restore`. iSAM2 cannot be copied, so each graph is made from its window.
-
-        The new graph has equal factors and linearisation points, and eliminates all factors at once. Its states
-        differ from those of the uninterrupted tracker by rounding: less than 1e-9 standard deviations.
-        """
+        """See `Stateful.restore`. Each graph is made from its window, as in `checkpoint`."""
         super().restore(snapshot)
+        self._make_again(snapshot["solved"])
+
+    def _make_again(self, tracks: Sequence[int]) -> None:
+        """Make new graphs of windows with the factors at their linearisation points, and solve them.
+
+        A window that cannot be solved keeps its states. It gets a graph at its next solution.
+        """
         self._graphs.clear()
-        self._read.clear()
-        tracks = np.array(snapshot["solved"], dtype=np.int64)
-        if len(tracks):
-            first = self.nodes.first[tracks]
-            self.solve(tracks, first, first.copy())
+        for track in tracks:
+            of = np.array([track])
+            try:
+                self._update(of, self.nodes.first[of])
+            except (RuntimeError, ValueError, IndexError):
+                self.forget(track)
 
     def forget(self, track: int) -> None:
         """See `Solver.forget`: the next solution makes a new graph."""
         self._graphs.pop(track, None)
-        self._read.clear()
-
-    def smoothed(
-        self, tracks: IntArray, indices: IntArray, after_s: FloatArray
-    ) -> FloatArray:
-        """See `Solver.smoothed`. Inside the windows, means and covariances come from the graphs."""
-        nodes, n = self.nodes, self.motion.dim
-        rows = zip(
-            tracks.tolist(),
-            indices.tolist(),
-            nodes.first[tracks].tolist(),
-            after_s.tolist(),
-            strict=True,
-        )
-        for track, index, first, time_s in rows:
-            if track not in self._graphs:  # nothing was fused: the window has one node
-                continue
-            last = max(index, first)
-            numbers = tuple(
-                nodes.numbers[
-                    track, last - (time_s > 0.0 and index > first) : last + 1
-                ].tolist()
-            )
-            if numbers in self._read:
-                continue
-            P, (left, *right) = self._covariance(track, *numbers), numbers
-            self._read.add(numbers)
-            for number in right:
-                A = psd_solve(
-                    P[n:, n:], P[n:, :n]
-                ).T  # the left state, given this state
-                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
-                    A,
-                    nodes.step[left] - A.dot(nodes.step[number]),
-                )
-                nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
-            nodes.P[right[0] if right else left] = P[-n:, -n:]
-        return super().smoothed(tracks, indices, after_s)
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
-        nodes = self.nodes
-        self._read.clear()
-        first = nodes.first[tracks]
-        is_leaving = first < anchors
-        if is_leaving.any():
-            self._solve(
-                tracks[is_leaving],
-                first[is_leaving],
-                anchors[is_leaving],
-                is_partial=True,
-            )
-        nodes.first[tracks] = anchors
+        first = self.nodes.first[tracks]
+        super().solve(tracks, starts, anchors)
         try:
             self._update(tracks, first)
         except (RuntimeError, ValueError, IndexError) as error:
-            nodes.tracks[tracks, KNOWN] = anchors  # the states that were read last
             for track in tracks.tolist():  # its graph may lack nodes
                 self.forget(track)
             raise np.linalg.LinAlgError(
                 f"the graph cannot be solved ({error})"
             ) from error
-        nodes.tracks[tracks, KNOWN] = anchors
 
-    def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        """Return the joint covariance of one node, shape (n, n), or of two neighbours, shape (2 n, 2 n)."""
+    def covariance(self, track: int, *numbers: int) -> FloatArray:
+        """Return gtsam's joint covariance of nodes, shape (k n, k n). It is a check of the compiled elimination.
+
+        `numbers` are one node, or several nodes, of the window of a track.
+        """
         isam: gtsam.ISAM2 = self._graphs[track].isam
         if len(numbers) == 1:
             return isam.marginalCovariance(numbers[0])
@@ -200,63 +167,72 @@ class IncrementalSolver(Solver):
         """
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
         leaving = (nodes.first[tracks] - starts).tolist()
-        for track, start, num_leaving in zip(
-            tracks.tolist(), starts.tolist(), leaving, strict=True
+        counts, graphs = nodes.count[tracks].tolist(), list[_Graph]()
+        windows, new, priors = list[list[int]](), list[list[int]](), list[_Changed]()
+        for track, row, start, count in zip(
+            tracks.tolist(), nodes.numbers[tracks], starts.tolist(), counts, strict=True
         ):
-            window, values = (
-                nodes.numbers[track, start : nodes.count[track]].copy(),
-                gtsam.Values(),
-            )
-            graph, prior = self._graphs.get(track), _Changed()
+            numbers = row[start:count].tolist()
+            graph = self._graphs.get(track)
+            priors.append({})
             if graph is None:
-                graph, oldest = _Graph(), nodes.predicted[window[0]]
-                self._graphs[track], W = graph, inverse_root(oldest[:, :-1])
-                prior[_PRIOR] = gtsam.JacobianFactor(
-                    int(window[0]), W, W @ oldest[:, -1], _unit(len(W))
-                )
-                nodes.labels[window, CHANGED] = 1
-            numbers = window.tolist()
-            for number in set(numbers).difference(graph.slots):
-                graph.slots[number] = None
-                values.insert(number, zero)
-                nodes.reference[number] = nodes.origin[number]
-            changed = self._changed_factors(track, start)
-            first = min(map(numbers.index, changed), default=0)
-            delta = graph.solve(numbers, num_leaving, values, first, changed | prior)
-            if not np.isfinite(delta).all():
-                raise ValueError("a state is not finite")
-            window = window[num_leaving:]
-            nodes.step[window] = (
-                nodes.reference[window]
-                - nodes.origin[window]
-                + delta.reshape(len(window), -1)
+                graph = self._graphs[track] = _Graph()
+                priors[-1][_PRIOR] = self._prior(numbers[0])
+                nodes.labels[numbers, CHANGED] = 1
+            graphs.append(graph)
+            windows.append(numbers)
+            new.append([number for number in numbers if number not in graph.slots])
+        made = [number for own in new for number in own]
+        nodes.reference[made] = nodes.origin[made]
+        changed = self._changed_factors(tracks, starts, priors)
+        inside = [own[num:] for own, num in zip(windows, leaving, strict=True)]
+        deltas = [
+            graph.solve(numbers, num, own_new, zero, own)
+            for graph, numbers, num, own_new, own in zip(
+                graphs, windows, leaving, new, changed, strict=True
             )
+        ]
+        delta = np.concatenate(deltas).reshape(-1, self.motion.dim)
+        if not np.isfinite(delta).all():
+            raise ValueError("a state is not finite")
+        window = np.array([number for own in inside for number in own])
+        nodes.step[window] = nodes.reference[window] - nodes.origin[window] + delta
 
-    def _changed_factors(self, track: int, start: int) -> _Changed:
-        """Return the factors of a track, from index `start` on, that have changed.
+    def _prior(self, number: int) -> gtsam.JacobianFactor:
+        """Return the factor of the prior of the oldest node of a window."""
+        prior = self.nodes.predicted[number]
+        W = inverse_root(prior[:, :-1])
+        return gtsam.JacobianFactor(number, W, W @ prior[:, -1], _unit(len(W)))
+
+    def _changed_factors(
+        self, tracks: IntArray, starts: IntArray, priors: Sequence[_Changed]
+    ) -> list[_Changed]:
+        """Return the factors of each of `tracks`, from index `starts` on, that have changed, and then its prior.
 
         Raises `ValueError` if process noise is not positive definite.
         """
         nodes, n = self.nodes, self.motion.dim
-        most = nodes.count[track] - start
-        owners = np.empty((most, 3), dtype=np.int64)
+        most = int((nodes.count[tracks] - starts).sum())
+        owners = np.empty((most, 4), dtype=np.int64)
         factors = np.empty((most, n + nodes.rows.shape[1], 2 * n + 1))
         num = factor_kernels.changed_factors(
-            track, start, nodes.arrays, owners, factors
+            tracks, starts, nodes.arrays, owners, factors
         )
         if num < 0:
             raise ValueError("process noise is not positive definite")
-        changed: _Changed = {}
-        for (number, right, size), each in zip(
+        changed: list[_Changed] = [{} for _ in priors]
+        for (row, number, right, size), each in zip(
             owners[:num].tolist(), factors, strict=False
         ):
             A, b, unit = each[:size, :n], each[:size, -1], _unit(size)
             if right < 0:
-                changed[number] = gtsam.JacobianFactor(number, A, b, unit)
+                changed[row][number] = gtsam.JacobianFactor(number, A, b, unit)
             else:
-                changed[number] = gtsam.JacobianFactor(
+                changed[row][number] = gtsam.JacobianFactor(
                     number, A, right, each[:size, n:-1], b, unit
                 )
+        for own, prior in zip(changed, priors, strict=True):
+            own.update(prior)
         return changed
 
 
