@@ -37,7 +37,9 @@ from fgtrack.tracking.decided_tracker import DecidedTracker
 from fgtrack.tracking.decisions.entries import decision_motion
 from fgtrack.tracking.decisions.history import Decisions
 from fgtrack.tracking.decisions.lives import DecidedLives
-from fgtrack.tracking.decisions.steps import BirthPrior, Returns, Rules
+from fgtrack.tracking.decisions.rules import Rules
+from fgtrack.tracking.decisions.second_returns import Returns
+from fgtrack.tracking.decisions.unseen import BirthPrior
 from fgtrack.tracking.ego.growth import EgoGrowth
 from fgtrack.tracking.ego.trajectory import EgoStd, EgoTrajectory
 from fgtrack.tracking.ego.waiting import PoseWait

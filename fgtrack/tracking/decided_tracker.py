@@ -20,7 +20,7 @@ from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
 from fgtrack.tracking.decisions.entries import Entry, Starts
 from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
-from fgtrack.tracking.decisions.steps import NONE, Ended
+from fgtrack.tracking.decisions.nodes import NONE, Ended
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.inbox import record
 from fgtrack.tracking.lives.counters import Scan

@@ -8,16 +8,16 @@ from typing import ClassVar
 from fgtrack.core.state import Stateful
 from fgtrack.models.motion import MotionModel
 from fgtrack.tracking.decisions.entries import Entry
-from fgtrack.tracking.decisions.steps import (
+from fgtrack.tracking.decisions.nodes import (
     NONE,
     Ended,
     Nodes,
-    Rules,
     Step,
     first_step,
-    following,
     living,
 )
+from fgtrack.tracking.decisions.rules import Rules
+from fgtrack.tracking.decisions.steps import following
 
 
 @dataclass(frozen=True)

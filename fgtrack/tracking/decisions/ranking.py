@@ -1,152 +1,260 @@
 """The best assignments of candidates to tracks, in the order of their likelihood."""
 
 import heapq
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from itertools import count
 from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.linalg import kernels
+from fgtrack.core.types import FloatArray, IntArray
 
 LARGEST_LOSS = 9.2
 """An assignment is left out if it is less likely than the best one by a factor of exp(9.2), about 10,000."""
-_FORBIDDEN = 1e9
+NONE = -1
+"""Candidate of a track that is missed."""
+_KERNELS = "fgtrack.tracking.decisions.assignment_kernels"
+_FREE, _BLOCKED = -1, -2
+_ROUNDING = 1e-9
+
+
+class Gains(NamedTuple):
+    """Log-likelihood ratios of pairs of tracks and candidates to missed tracks. Track i has the pairs `first[i]` to
+    `first[i + 1]`.
+    """
+
+    first: IntArray
+    """Shape (n + 1,)."""
+    candidates: IntArray
+    """Candidate of each pair, shape (p,)."""
+    values: FloatArray
+    """Log-likelihood ratio of each pair, shape (p,)."""
+    num_candidates: int
+
+    @classmethod
+    def of(
+        cls,
+        tracks: IntArray,
+        candidates: IntArray,
+        values: FloatArray,
+        num_tracks: int,
+        num_candidates: int,
+    ) -> "Gains":
+        """Return the gains of pairs in any order; the arrays have the shape (p,)."""
+        order = np.lexsort((candidates, tracks))
+        counts = np.bincount(tracks, minlength=num_tracks)
+        first = np.concatenate([[0], np.cumsum(counts)])
+        return cls(first, candidates[order], values[order], num_candidates)
+
+    def at(self, rows: IntArray) -> "Gains":
+        """Return the gains of the tracks in `rows`."""
+        counts = np.diff(self.first)[rows]
+        first = np.concatenate([[0], np.cumsum(counts)])
+        chosen = np.arange(first[-1]) + np.repeat(self.first[rows] - first[:-1], counts)
+        return Gains(
+            first, self.candidates[chosen], self.values[chosen], self.num_candidates
+        )
 
 
 class Ranked(NamedTuple):
-    """One assignment."""
+    """An assignment of one of several problems."""
 
     gain: float
-    """Log-likelihood ratio to the assignment in which all tracks are missed."""
-    pairs: tuple[tuple[int, int], ...]
-    """Pairs (track, candidate)."""
+    """Log-likelihood ratio to the assignment in which all tracks are missed, plus the gain of the problem."""
+    problem: int
+    """Number of the problem."""
+    candidates: IntArray
+    """Candidate of each track, `NONE` for a missed one, shape (n,)."""
 
 
-def best_assignments(
-    pairs: Iterable[tuple[int, int, float]], most: int
-) -> list[Ranked]:
-    """Return at most `most` assignments, the best one first.
+def best_assignments(problems: Sequence[tuple[float, Gains]]) -> Iterator[Ranked]:
+    """Yield the assignments of all `problems`, the best one first; `problems` are gains of problems, and of pairs.
 
-    `pairs` are track, candidate, and the log-likelihood ratio of the pair to a missed track. Each track and each
-    candidate is used at most once. Tracks that compete for no candidate are independent, so each cluster of competing
-    tracks is solved by itself.
+    Each track and each candidate of a problem is used at most once. Assignments that are less likely than the best one
+    by more than `LARGEST_LOSS` are left out.
     """
-    best = [Ranked(0.0, ())]
-    for cluster in _clusters(pairs):
-        best = _combined(best, _ranked(cluster, most), most)
-    return best
-
-
-_Cluster = dict[int, dict[int, float]]
-
-
-def _clusters(pairs: Iterable[tuple[int, int, float]]) -> list[_Cluster]:
-    """Return the gains by track and candidate of each cluster of tracks that share candidates, directly or not."""
-    clusters: list[_Cluster] = []
-    of_track: dict[int, _Cluster] = {}
-    of_candidate: dict[int, _Cluster] = {}
-    for track, candidate, gain in pairs:
-        own, other = of_track.get(track), of_candidate.get(candidate)
-        if own is None:
-            own = other if other is not None else {}
-            if other is None:
-                clusters.append(own)
-            of_track[track] = own
-        elif other is not None and other is not own:
-            own.update(other)
-            clusters = [each for each in clusters if each is not other]
-            for each, gains in other.items():
-                of_track[each] = own
-                for taken in gains:
-                    of_candidate[taken] = own
-        of_candidate[candidate] = own
-        own.setdefault(track, {})[candidate] = gain
-    return clusters
-
-
-def _ranked(cluster: _Cluster, most: int) -> list[Ranked]:
-    """Return the best assignments of one cluster, the best one first."""
-    if len(cluster) == 1:
-        [(track, gains)] = cluster.items()
-        found = [
-            Ranked(gain, ((track, candidate),)) for candidate, gain in gains.items()
-        ]
-        found.append(Ranked(0.0, ()))
-        return sorted(found, key=_order)[:most]
-    tracks = sorted(cluster)
-    candidates = sorted({each for gains in cluster.values() for each in gains})
-    cost = np.full((len(tracks), len(candidates) + len(tracks)), _FORBIDDEN)
-    for row, track in enumerate(tracks):
-        cost[row, len(candidates) + row] = 0.0
-        for candidate, gain in cluster[track].items():
-            cost[row, candidates.index(candidate)] = -gain
-    return [
-        Ranked(
-            -value,
-            tuple(
-                (tracks[row], candidates[column])
-                for row, column in enumerate(columns)
-                if column < len(candidates)
-            ),
-        )
-        for value, columns in _murty(cost, most)
+    solved = [
+        _Problem(number, gain, gains) for number, (gain, gains) in enumerate(problems)
     ]
+    least = max(each.best.gain for each in solved) - LARGEST_LOSS
+    solved = [each for each in solved if each.best.gain >= least]
+    for each in solved:
+        each.restrict(least)
+    numbers = count()  # the earlier of two equal gains comes first
+    heap: list[tuple[float, int, _Problem, _Solution, int | None]] = [
+        (-each.best.gain, next(numbers), each, each.best, None) for each in solved
+    ]
+    heapq.heapify(heap)
+    while heap:
+        _, _, problem, solution, position = heapq.heappop(heap)
+        if position is None:
+            yield problem.ranked(solution)
+            for position, bound in problem.bounds(solution, least):
+                entry = (-bound, next(numbers), problem, solution, position)
+                heapq.heappush(heap, entry)
+            continue
+        branch = problem.branch(solution, position)
+        if branch is not None and branch.gain >= least:
+            heapq.heappush(heap, (-branch.gain, next(numbers), problem, branch, None))
 
 
-def _order(ranked: Ranked) -> tuple[float, tuple[tuple[int, int], ...]]:
-    """Return the sort key: the largest gain comes first, equal gains come in the order of their pairs."""
-    return -ranked.gain, ranked.pairs
+class _Solution(NamedTuple):
+    """An assignment, which is the best one of all that have the same pairs for the first `decided` open tracks."""
+
+    gain: float
+    chosen: IntArray
+    """Pair of each track, or `NONE`, shape (n,)."""
+    decided: int
+    excluded: tuple[int, ...]
+    """Pairs that the open track number `decided` may not have; `NONE` excludes a miss."""
 
 
-def _combined(
-    first: Sequence[Ranked], second: Sequence[Ranked], most: int
-) -> list[Ranked]:
-    """Return the best combinations of the assignments of independent clusters."""
-    least = first[0].gain + second[0].gain - LARGEST_LOSS
-    found = []
-    for own in first:
-        for other in second:
-            gain = own.gain + other.gain
-            if gain < least:
-                break
-            found.append(Ranked(gain, own.pairs + other.pairs))
-    return sorted(found, key=_order)[:most]
-
-
-def _murty(cost: FloatArray, most: int) -> list[tuple[float, list[int]]]:
-    """Return the assignments with the least costs, the best one first: cost, and the column of each row.
+class _Problem:
+    """Search for the best assignments.
 
     Source: Murty, "An algorithm for ranking all the assignments in order of increasing cost", Operations Research
-    16(3), 1968.
+    16(3), 1968. The prices of the best assignment bound the loss of each pair, so most tracks have one pair left.
     """
-    from scipy.optimize import linear_sum_assignment
 
-    found: list[tuple[float, list[int]]] = []
-    heap: list[tuple[float, int, list[int], FloatArray, int]] = []
-    numbers = count()  # the earlier of two equal costs comes first
+    def __init__(self, number: int, gain: float, gains: Gains) -> None:
+        self._number, self._base, self._gains = number, gain, gains
+        n = self._num_tracks = len(gains.first) - 1
+        self._num_columns = gains.num_candidates + n
+        self._costs = -gains.values
+        self._lengths = np.full(self._num_columns, math.inf)
+        self._work = np.zeros((4, self._num_columns), dtype=np.int64)
+        self._is_allowed = np.ones(len(self._costs), dtype=bool)
+        self._is_missable = np.ones(n, dtype=bool)
+        self._prices = np.zeros(n), np.zeros(self._num_columns)
+        chosen, holders = np.full(n, NONE), np.full(self._num_columns, _FREE)
+        self._assign(np.arange(n), holders, chosen, *self._prices)
+        self.best = _Solution(self._gain(chosen), chosen, 0, ())
+        """The best assignment."""
 
-    def add(restricted: FloatArray, first: int) -> None:
-        rows, columns = linear_sum_assignment(restricted)
-        value = float(restricted[rows, columns].sum())
-        if value < 0.5 * _FORBIDDEN and (
-            not found or value < found[0][0] + LARGEST_LOSS
-        ):
-            heapq.heappush(
-                heap, (value, next(numbers), columns.tolist(), restricted, first)
+    def ranked(self, solution: _Solution) -> Ranked:
+        """Return a solution with candidates."""
+        candidates = solution.chosen.copy()
+        taken = candidates != NONE
+        candidates[taken] = self._gains.candidates[candidates[taken]]
+        return Ranked(solution.gain, self._number, candidates)
+
+    def restrict(self, least: float) -> None:
+        """Leave out the pairs whose assignments have gains below `least`; find the tracks that still have a choice."""
+        n, m = self._num_tracks, self._gains.num_candidates
+        row_prices, column_prices = self._prices
+        limit = self.best.gain - least + _ROUNDING
+        owners = np.repeat(np.arange(n), np.diff(self._gains.first))
+        losses = (
+            self._costs - row_prices[owners] - column_prices[self._gains.candidates]
+        )
+        missed_losses = -row_prices - column_prices[m:]
+        self._is_allowed = losses <= limit
+        self._is_missable = missed_losses <= limit
+        kept = self._is_allowed.nonzero()[0]
+        is_open = self._is_missable + np.bincount(owners[kept], minlength=n) > 1
+        self._clusters = _clusters(owners[kept], self._gains.candidates[kept], n)
+        order = np.argsort(self._clusters, kind="stable")
+        self._open = order[is_open[order]]
+        self._positions = np.full(n, len(order))
+        self._positions[self._open] = np.arange(len(self._open))
+        # The two least losses of each track, and the pair of the least one.
+        every = np.concatenate(
+            [np.where(self._is_allowed, losses, math.inf), missed_losses]
+        )
+        of = np.concatenate([owners, np.arange(n)])
+        pairs = np.concatenate([np.arange(len(losses)), np.full(n, NONE)])
+        by_loss = np.lexsort((every, of))
+        starts = np.searchsorted(of[by_loss], np.arange(n))
+        self._likeliest = pairs[by_loss[starts]]
+        following = np.minimum(starts + 1, max(len(by_loss) - 1, 0))
+        has_second = of[by_loss[following]] == np.arange(n)
+        has_second &= following > starts
+        self._second_losses = np.where(has_second, every[by_loss[following]], math.inf)
+
+    def bounds(self, solution: _Solution, least: float) -> Iterator[tuple[int, float]]:
+        """Yield the open tracks that may have another pair than in `solution`, and an upper bound of the gain then.
+
+        Bounds below `least` are left out.
+        """
+        tracks = self._open
+        is_likeliest = solution.chosen[tracks] == self._likeliest[tracks]
+        losses = np.where(is_likeliest, self._second_losses[tracks], 0.0)
+        bounds = np.minimum(solution.gain, self.best.gain - losses)
+        for position in (bounds >= least - _ROUNDING).nonzero()[0].tolist():
+            if position >= solution.decided:
+                yield position, float(bounds[position])
+
+    def branch(self, parent: _Solution, position: int) -> _Solution | None:
+        """Return the best assignment with the pairs of `parent` for the open tracks before `position`, and with
+        another pair for the open track there; None without one.
+        """
+        track = int(self._open[position])
+        own = int(parent.chosen[track])
+        excluded = (*(parent.excluded if position == parent.decided else ()), own)
+        members = (self._clusters == self._clusters[track]).nonzero()[0]
+        is_decided = self._positions[members] < position
+        chosen, holders = parent.chosen.copy(), np.full(self._num_columns, _FREE)
+        pairs = chosen[members[is_decided]]
+        holders[self._gains.candidates[pairs[pairs != NONE]]] = _BLOCKED
+        changed = [pair for pair in excluded if pair != NONE]
+        kept, is_missable = self._is_allowed[changed], self._is_missable[track]
+        self._is_allowed[changed] = False
+        self._is_missable[track] = is_missable and NONE not in excluded
+        is_solved = self._assign(
+            members[~is_decided],
+            holders,
+            chosen,
+            np.zeros(self._num_tracks),
+            np.zeros(self._num_columns),
+        )
+        self._is_allowed[changed], self._is_missable[track] = kept, is_missable
+        if not is_solved:
+            return None
+        return _Solution(self._gain(chosen), chosen, position, excluded)
+
+    def _assign(
+        self,
+        rows: IntArray,
+        holders: IntArray,
+        chosen: IntArray,
+        row_prices: FloatArray,
+        column_prices: FloatArray,
+    ) -> bool:
+        return bool(
+            kernels(_KERNELS).assign(
+                rows,
+                self._gains.first,
+                self._gains.candidates,
+                self._costs,
+                self._is_allowed,
+                self._is_missable,
+                holders,
+                chosen,
+                row_prices,
+                column_prices,
+                self._lengths,
+                self._work,
             )
+        )
 
-    add(cost, 0)
-    while heap and len(found) < most:
-        value, _, columns, restricted, first = heapq.heappop(heap)
-        found.append((value, columns))
-        restricted = restricted.copy()
-        for row in range(first, len(columns)):
-            column = columns[row]
-            without = restricted.copy()
-            without[row, column] = _FORBIDDEN
-            add(without, row)
-            own = restricted[row, column]
-            restricted[row] = restricted[:, column] = _FORBIDDEN
-            restricted[row, column] = own
-    return found
+    def _gain(self, chosen: IntArray) -> float:
+        return self._base + float(self._gains.values[chosen[chosen != NONE]].sum())
+
+
+def _clusters(tracks: IntArray, candidates: IntArray, num_tracks: int) -> IntArray:
+    """Return the number of the cluster of each track, shape (n,). Clusters share no candidate of the pairs (p,)."""
+    labels = list(range(num_tracks))
+
+    def label(track: int) -> int:
+        while labels[track] != track:
+            labels[track] = track = labels[labels[track]]
+        return track
+
+    holder: dict[int, int] = {}
+    for track, candidate in zip(tracks.tolist(), candidates.tolist(), strict=True):
+        other = holder.setdefault(candidate, track)
+        first, second = sorted((label(track), label(other)))
+        labels[second] = first
+    return np.array([label(track) for track in range(num_tracks)], dtype=np.int64)

@@ -1,0 +1,158 @@
+"""The table of log-likelihoods of a list: each candidate with each track, as clutter, and as a new object."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.estimation.base import StatesAt
+from fgtrack.tracking.association import near, reaches_m
+from fgtrack.tracking.decisions.entries import NOTHING, Entry
+from fgtrack.tracking.decisions.measurements import log_densities, renewed
+from fgtrack.tracking.decisions.nodes import Nodes
+from fgtrack.tracking.decisions.ranking import LARGEST_LOSS, Gains
+from fgtrack.tracking.decisions.rules import Rules
+from fgtrack.tracking.decisions.unseen import Unseen, densities_of
+from fgtrack.tracking.objects import differ
+
+_GATE_PROBABILITY = 0.99999
+_LEAST_GAIN = -LARGEST_LOSS
+
+
+@dataclass(frozen=True)
+class Table:
+    """Log-likelihoods of a list with m candidates, for n tracks."""
+
+    gains: Gains
+    """Log-likelihood ratios of pairs to a missed track and a candidate without a track."""
+    log_missed: FloatArray
+    """Log-likelihood of each track without a candidate, shape (n,)."""
+    born: FloatArray
+    """Probability that each candidate without a track is a new object, shape (m,)."""
+    detectable: FloatArray
+    """Probability that each track is detected, if it exists, shape (n,)."""
+    in_view: BoolArray
+    """True for each track that the list would show, shape (n,)."""
+    jumps: set[tuple[int, int]]
+    """Pairs (track, candidate) whose correlated error is probably new."""
+
+
+def likelihoods(
+    nodes: Nodes,
+    entry: Entry,
+    in_view: BoolArray,
+    unseen: Sequence[Unseen],
+    returns: FloatArray,
+    rules: Rules,
+) -> Table:
+    """Return the log-likelihoods of a list."""
+    sensor = entry.sensor
+    detectable = sensor.detection_probability * nodes.visible[:, entry.index]
+    now = nodes.existed * nodes.alive
+    misses = sensor.gives_position and sensor.scan and entry.batch.last
+    missed = (
+        np.where(in_view, 1.0 - now * detectable, 1.0) if misses else np.ones(len(now))
+    )
+    log_free, born = _free(entry, unseen, returns, rules)
+    rows, columns, log_densities, jumps = _pairs(nodes, entry)
+    more = _described(nodes, entry, rows, columns)
+    gains = (
+        np.log(np.maximum(now * detectable, 1e-300))[rows]
+        - np.log(missed)[rows]
+        + log_densities
+        + more
+        - log_free[columns]
+    )
+    likely = gains > _LEAST_GAIN
+    return Table(
+        Gains.of(
+            rows[likely],
+            columns[likely],
+            gains[likely],
+            len(nodes.roots),
+            len(entry.candidates),
+        ),
+        np.log(missed),
+        born,
+        detectable,
+        in_view & misses,
+        set(zip(rows[jumps].tolist(), columns[jumps].tolist(), strict=True)),
+    )
+
+
+def _free(
+    entry: Entry,
+    unseen: Sequence[Unseen],
+    returns: FloatArray,
+    rules: Rules,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the log-density of candidates without a track (m,), and the probability that they start a track (m,).
+
+    A candidate without a track is clutter, a second return of a track, or a new object.
+    """
+    clutter = np.exp(entry.log_clutter)
+    if rules.prior is None:
+        new = rules.birth_odds * np.exp(entry.log_clutter + entry.scores)
+    else:
+        new = densities_of(entry, unseen).sum(axis=0)
+    new = np.where(entry.may_start, new, 0.0)
+    starts = np.where(entry.may_start, new + returns, 0.0)
+    total = clutter + np.maximum(starts, returns)
+    return np.log(total), starts / total
+
+
+def _pairs(
+    nodes: Nodes, entry: Entry
+) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+    """Return the pairs of tracks and candidates inside the gate, their log-densities, and the pairs with a jump.
+
+    The correlated error of a pair is that of the track's last detection, or with the probability of a jump new.
+    """
+    m = len(entry.candidates)
+    if not m or not len(nodes.roots):
+        nothing = np.zeros(0, dtype=np.int64)
+        return nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool)
+    new = renewed(nodes.means, nodes.covariances, entry)
+    states = StatesAt((), nodes.means, nodes.covariances)
+    reach_m = reaches_m(entry.groups, states, _GATE_PROBABILITY, 5000.0)
+    if new is not None:
+        reach_m = np.maximum(
+            reach_m,
+            reaches_m(entry.groups, StatesAt((), *new), _GATE_PROBABILITY, 5000.0),
+        )
+    pairs = near(entry.candidates, nodes.means, reach_m)
+    columns, rows = pairs.rows, pairs.columns
+    found = log_densities(entry, rows, columns, nodes.means, nodes.covariances)
+    jumps = np.zeros(len(rows), dtype=bool)
+    if new is not None:
+        p = entry.jump_probability
+        stays = found + math.log1p(-p)
+        moves = log_densities(entry, rows, columns, *new) + math.log(p)
+        found, jumps = np.logaddexp(stays, moves), moves > stays
+    return rows, columns, found, jumps
+
+
+def _described(
+    nodes: Nodes, entry: Entry, rows: IntArray, columns: IntArray
+) -> FloatArray:
+    """Return the log-likelihood ratio of classes and identities of each pair."""
+    result = np.zeros(len(rows))
+    if not entry.is_described:
+        return result
+    wrong = entry.sensor.wrong_id_probability
+    weight = math.log((1.0 - wrong) / wrong)
+    own = entry.descriptions
+    for k, (row, column) in enumerate(
+        zip(rows.tolist(), columns.tolist(), strict=True)
+    ):
+        track, candidate = nodes.descriptions[row], own[column]
+        if track is NOTHING or candidate is NOTHING:
+            continue
+        if differ(track.class_name, candidate.class_name):
+            result[k] = -1e300
+            continue
+        if track.ids and candidate.ids:
+            result[k] = weight if track.identity == candidate.identity else -weight
+    return result

@@ -1,0 +1,115 @@
+"""Second returns: the other end of a long hull, or another object?"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.tracking.decisions.entries import Entry
+from fgtrack.tracking.decisions.nodes import Nodes
+from fgtrack.tracking.lives.existence import densities
+
+_HULL_STD_MPS = 0.5
+"""Standard deviation of the velocity between both ends of a hull that turns."""
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Second returns of a sensor."""
+
+    share: float
+    std_m: float
+    log_new_per_m2: float
+    """Logarithm of the density of new objects in a list."""
+    detection_probability: float
+
+    def log_seen(self, hits: int, misses: int) -> float:
+        """Return the log-likelihood ratio of an object against second returns, of detections in `hits` lists.
+
+        An object is detected with its probability. Each hull has a share of second returns of its own, which has a
+        beta distribution of the strength of two lists.
+        """
+        a, b = 2.0 * self.share, 2.0 * (1.0 - self.share)
+        own = hits * math.log(self.detection_probability) + misses * math.log1p(
+            -self.detection_probability
+        )
+        return own - _log_beta(a + hits, b + misses) + _log_beta(a, b)
+
+
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+
+
+def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray:
+    """Return the density of second returns of the tracks in `rows` at each candidate, in 1/m^2, shape (m,)."""
+    own = entry.sensor.second_returns
+    result = np.zeros(len(entry.candidates))
+    if own is None or not len(rows) or not entry.placed.any():
+        return result
+    detected = (nodes.existed * nodes.alive * nodes.visible[:, entry.index])[
+        rows
+    ] * entry.sensor.detection_probability
+    y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
+    P = nodes.covariances[rows][:, :2, :2] + own.std_m**2 * np.eye(2)
+    m, t = y_m.shape[:2]
+    spreads = np.tile(P, (m, 1, 1))
+    found = densities(y_m.reshape(-1, 2), spreads, np.zeros(spreads.shape))
+    returned = own.share * found.reshape(m, t) @ detected
+    return np.asarray(np.where(entry.placed, returned, 0.0))
+
+
+def own_probabilities(
+    nodes: Nodes, rows: IntArray, returns: Mapping[int, Returns], speed_std_mps: float
+) -> FloatArray:
+    """Return the probability that each track is an object of its own, shape (n,), and no second return of a track in
+    `rows`.
+
+    The second return moves with the hull: the distance of both tracks is normal with the standard deviation
+    of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
+    velocity of its own. A track with fewer detections may be a second return of a track with more detections.
+    """
+    own = np.ones(len(nodes.roots))
+    if not returns or len(rows) < 2:
+        return own
+    position, velocity = slice(0, 2), slice(2, 4)
+    exists = nodes.existed * nodes.alive
+    speeds_m2ps2 = 2.0 * speed_std_mps**2 * np.eye(2)
+    slow_m2ps2 = _HULL_STD_MPS**2 * np.eye(2)
+    for k in range(len(own)):
+        given = returns.get(int(nodes.sensors[k]))
+        if given is None:
+            continue
+        hosts = rows[
+            (nodes.counts[rows] > nodes.counts[k])
+            & (
+                np.hypot(*(nodes.means[rows, :2] - nodes.means[k, :2]).T)
+                < 6.0 * given.std_m
+            )
+        ]
+        if not len(hosts):
+            continue
+        x = nodes.means[hosts] - nodes.means[k]
+        P = nodes.covariances[hosts] + nodes.covariances[k]
+        size_m2 = given.std_m**2 * np.eye(2)
+        log_return = (
+            np.log(given.share * exists[hosts])
+            + _log_normal(x[:, position], P[:, position, position] + size_m2)
+            + _log_normal(x[:, velocity], P[:, velocity, velocity] + slow_m2ps2)
+        )
+        log_object = given.log_new_per_m2 + _log_normal(
+            x[:, velocity], P[:, velocity, velocity] + speeds_m2ps2
+        )
+        log_object = log_object + given.log_seen(
+            int(nodes.counts[k]), int(nodes.misses[k])
+        )
+        odds = np.exp(np.clip(log_return - log_object, -50.0, 50.0)).sum()
+        own[k] = 1.0 / (1.0 + odds)
+    return own
+
+
+def _log_normal(x: FloatArray, P: FloatArray) -> FloatArray:
+    """Return log N(x; 0, P) of vectors (m, 2) with covariances (m, 2, 2), shape (m,)."""
+    own = densities(np.ascontiguousarray(x), P, np.zeros(P.shape))
+    return np.asarray(np.log(np.maximum(own, 1e-300)))
