@@ -17,7 +17,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Measurement, Measurements, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
-from fgtrack.tracking.decisions.entries import Entry, Starts
+from fgtrack.tracking.decisions.entries import NOTHING, Entry, Starts
 from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
 from fgtrack.tracking.decisions.nodes import NONE, Ended
@@ -240,8 +240,7 @@ class DecidedTracker(MultiObjectTracker):
         again: set[int],
     ) -> None:
         """Publish the decisions. Estimate tracks once more whose detections have changed, and those in `again`."""
-        lost: list[tuple[Entry, int, int]] = []
-        won: list[tuple[Entry, int, int]] = []
+        lost: dict[int, list[tuple[Entry, int]]] = {}
         added: list[tuple[Entry, list[int]]] = []
         for each, own in zip(changes, named, strict=True):
             before = self._of[each.entry.number]
@@ -253,28 +252,27 @@ class DecidedTracker(MultiObjectTracker):
                 if not is_new:
                     self._note(each.entry, position, old, public)
                 if old is not None:
-                    again.add(old)
-                    lost.append((each.entry, position, old))
+                    lost.setdefault(old, []).append((each.entry, position))
                 if public is not None:
                     is_birth = each.taken[position] == each.entry.roots[position]
                     if self._is_unknown(public) != (is_birth and is_new):
                         again.add(public)
                     new_positions.append(position)
-                    won.append((each.entry, position, public))
             self._of[each.entry.number] = own
             if new_positions:
                 added.append((each.entry, new_positions))
         self._results: dict[int, UpdateRecord] = {}
+        for public, places in sorted(lost.items()):
+            is_old = self._began_before_horizon(public)
+            if not is_old and not all(self._leaves_no_trace(*at) for at in places):
+                again.add(public)
+            if is_old or public not in again:
+                undone = [self._withdraw(*at) for at in places]
+                if not all(undone):
+                    again.add(public)
+        again = {each for each in again if not self._began_before_horizon(each)}
         for public in sorted(again):
-            if self._began_before_horizon(public):
-                for lost_entry, position, old in lost:
-                    if old == public:
-                        self._withdraw(lost_entry, position)
-                for won_entry, position, new in won:
-                    if new == public:
-                        self._fuse(won_entry, [position], won_entry is entry)
-            else:
-                self._rebuild(public, entry)
+            self._rebuild(public, entry)
         for each_entry, positions in added:
             rest = [p for p in positions if self._of[each_entry.number][p] not in again]
             births = [
@@ -315,19 +313,31 @@ class DecidedTracker(MultiObjectTracker):
 
     def _began_before_horizon(self, public: int) -> bool:
         """True for a track that an estimator holds, and whose first detection is decided for good."""
-        root, entries = self._roots.get(public), self.decisions.entries
-        return not self._is_unknown(public) and not any(
-            root in entry.roots for entry in entries
+        bank_id = self._tracks.bank_id(public)
+        return bank_id is not None and not self._began_inside(bank_id)
+
+    def _leaves_no_trace(self, entry: Entry, position: int) -> bool:
+        """True for a candidate from which a track learns nothing but its state."""
+        known = self._fused_as.get((entry.number, position))
+        return (
+            known is not None
+            and entry.descriptions[position] is NOTHING
+            and "yaw_rad" not in known[1].model.components
         )
 
-    def _withdraw(self, entry: Entry, position: int) -> None:
-        """Undo the fusion of a candidate with its former track. A bank that cannot undo it keeps it."""
+    def _withdraw(self, entry: Entry, position: int) -> bool:
+        """Undo the fusion of a candidate with its former track; return False if the bank cannot undo it.
+
+        What the track has learned from a class, an identity or a yaw stays.
+        """
         known = self._fused_as.pop((entry.number, position), None)
         if known is None:
-            return
+            return False
         bank_id, stack, row = known
-        if self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
-            self._tracks.num_measured[bank_id] -= 1
+        if not self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
+            return False
+        self._tracks.num_measured[bank_id] -= 1
+        return True
 
     def _rebuild(self, public: int, newest: Entry | None = None) -> None:
         """Estimate a track once more, from its first detection inside the horizon."""
@@ -437,12 +447,17 @@ class DecidedTracker(MultiObjectTracker):
         step = self.decisions.newest
         if step is None:
             return
+        best, nodes = step.hypotheses[0], step.nodes
+        matched = set(best.taken)
+        exists = nodes.existed * nodes.alive * nodes.own
         living = set[int]()
-        rows = step.hypotheses[0].rows.tolist()
-        nodes = step.nodes
-        matched = set(step.hypotheses[0].taken)
-        for row in rows:
-            root = int(nodes.roots[row])
+        for root, probability, hazard_hz, is_confirmed in zip(
+            nodes.roots[best.rows].tolist(),
+            exists[best.rows].tolist(),
+            nodes.hazards_hz[best.rows].tolist(),
+            nodes.is_confirmed[best.rows].tolist(),
+            strict=True,
+        ):
             public = self._public.get(root)
             if public is None:
                 continue
@@ -452,28 +467,26 @@ class DecidedTracker(MultiObjectTracker):
             if held is None:
                 continue
             living.add(held)
-            self._lives.live(
-                held,
-                Life(
-                    float(nodes.existed[row] * nodes.alive[row] * nodes.own[row]),
-                    step.stamp_ns,
-                    float(nodes.hazards_hz[row]),
-                    bool(nodes.is_confirmed[row]),
-                    root not in matched,
-                ),
+            is_coasting = root not in matched
+            life = Life(
+                probability, step.stamp_ns, hazard_hz, is_confirmed, is_coasting
             )
-        roots = {root for entry in self.decisions.entries for root in entry.roots}
+            self._lives.live(held, life)
         for bank_id in self._parts.bank.track_ids:
             if bank_id in living or self._lives.is_suspended(bank_id):
                 continue
-            life = self._lives.lives.get(bank_id)
-            was_confirmed = life is not None and life.is_confirmed
-            begun = self._roots.get(self._tracks.public(bank_id))
+            known = self._lives.lives.get(bank_id)
+            was_confirmed = known is not None and known.is_confirmed
             is_single = self._tracks.num_measured[bank_id] < 2
-            if begun in roots and is_single and not was_confirmed:
+            if is_single and not was_confirmed and self._began_inside(bank_id):
                 self._tracks.drop(bank_id)
             else:
                 self._lives.suspend(bank_id, step.stamp_ns)
+
+    def _began_inside(self, bank_id: int) -> bool:
+        """True for a track whose first detection is not decided for good."""
+        root = self._roots.get(self._tracks.public(bank_id))
+        return any(root in entry.roots for entry in self.decisions.entries)
 
     def _record(self, entry: Entry) -> None:
         """Record what has become of the detections of a list."""

@@ -24,6 +24,7 @@ MODULES = (
     "fgtrack.estimation.smoothing.linearisation_kernels",
     "fgtrack.estimation.smoothing.relinearisation_kernels",
     "fgtrack.estimation.smoothing.solution_kernels",
+    "fgtrack.tracking.decisions.assignment_kernels",
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
     "fgtrack.tracking.lives.counter_kernels",

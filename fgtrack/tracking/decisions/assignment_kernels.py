@@ -142,3 +142,30 @@ def assign(
         ):
             return False
     return True
+
+
+@njit("void(int64[::1], int64[::1], int64[::1], int64[::1])")
+def label_clusters(
+    tracks: IntArray, candidates: IntArray, holders: IntArray, labels: IntArray
+) -> None:
+    """Write the least track of the cluster of each track to `labels` (n,). Clusters share no candidate.
+
+    The pairs `tracks` and `candidates` have the shape (p,). `holders` (m,) is `FREE` before the call.
+    """
+    check(len(tracks) == len(candidates))
+    check_rows(tracks, 0, len(labels))
+    check_rows(candidates, 0, len(holders))
+    for i in range(len(labels)):
+        labels[i] = i
+    for k in range(len(tracks)):
+        if holders[candidates[k]] == FREE:
+            holders[candidates[k]] = tracks[k]
+            continue
+        first, second = tracks[k], holders[candidates[k]]
+        while labels[first] != first:
+            first = labels[first]
+        while labels[second] != second:
+            second = labels[second]
+        labels[max(first, second)] = min(first, second)
+    for i in range(len(labels)):
+        labels[i] = labels[labels[i]]  # labels of lesser tracks are final

@@ -80,8 +80,6 @@ def best_assignments(problems: Sequence[tuple[float, Gains]]) -> Iterator[Ranked
     ]
     least = max(each.best.gain for each in solved) - LARGEST_LOSS
     solved = [each for each in solved if each.best.gain >= least]
-    for each in solved:
-        each.restrict(least)
     numbers = count()  # the earlier of two equal gains comes first
     heap: list[tuple[float, int, _Problem, _Solution, int | None]] = [
         (-each.best.gain, next(numbers), each, each.best, None) for each in solved
@@ -140,7 +138,7 @@ class _Problem:
         candidates[taken] = self._gains.candidates[candidates[taken]]
         return Ranked(solution.gain, self._number, candidates)
 
-    def restrict(self, least: float) -> None:
+    def _restrict(self, least: float) -> None:
         """Leave out the pairs whose assignments have gains below `least`; find the tracks that still have a choice."""
         n, m = self._num_tracks, self._gains.num_candidates
         row_prices, column_prices = self._prices
@@ -154,7 +152,7 @@ class _Problem:
         self._is_missable = missed_losses <= limit
         kept = self._is_allowed.nonzero()[0]
         is_open = self._is_missable + np.bincount(owners[kept], minlength=n) > 1
-        self._clusters = _clusters(owners[kept], self._gains.candidates[kept], n)
+        self._clusters = _clusters(owners[kept], self._gains.candidates[kept], n, m)
         order = np.argsort(self._clusters, kind="stable")
         self._open = order[is_open[order]]
         self._positions = np.full(n, len(order))
@@ -176,8 +174,10 @@ class _Problem:
     def bounds(self, solution: _Solution, least: float) -> Iterator[tuple[int, float]]:
         """Yield the open tracks that may have another pair than in `solution`, and an upper bound of the gain then.
 
-        Bounds below `least` are left out.
+        Bounds below `least` are left out. Every call has the same `least`.
         """
+        if solution is self.best:
+            self._restrict(least)
         tracks = self._open
         is_likeliest = solution.chosen[tracks] == self._likeliest[tracks]
         losses = np.where(is_likeliest, self._second_losses[tracks], 0.0)
@@ -243,18 +243,11 @@ class _Problem:
         return self._base + float(self._gains.values[chosen[chosen != NONE]].sum())
 
 
-def _clusters(tracks: IntArray, candidates: IntArray, num_tracks: int) -> IntArray:
+def _clusters(
+    tracks: IntArray, candidates: IntArray, num_tracks: int, num_candidates: int
+) -> IntArray:
     """Return the number of the cluster of each track, shape (n,). Clusters share no candidate of the pairs (p,)."""
-    labels = list(range(num_tracks))
-
-    def label(track: int) -> int:
-        while labels[track] != track:
-            labels[track] = track = labels[labels[track]]
-        return track
-
-    holder: dict[int, int] = {}
-    for track, candidate in zip(tracks.tolist(), candidates.tolist(), strict=True):
-        other = holder.setdefault(candidate, track)
-        first, second = sorted((label(track), label(other)))
-        labels[second] = first
-    return np.array([label(track) for track in range(num_tracks)], dtype=np.int64)
+    labels = np.empty(num_tracks, dtype=np.int64)
+    holders = np.full(num_candidates, _FREE)
+    kernels(_KERNELS).label_clusters(tracks, candidates, holders, labels)
+    return labels
