@@ -19,7 +19,9 @@ from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
 from fgtrack.meaning.components import uninformative
 from fgtrack.meaning.corrected import corrected_message
 from fgtrack.meaning.coverage import Coverage, coverages
+from fgtrack.meaning.scattered_noise import Scatter, scattered_noise
 from fgtrack.meaning.single_reports import SingleReports
+from fgtrack.meaning.tracklets import points_of
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.lives.existence import ExistenceRules
@@ -46,6 +48,9 @@ _TICKS_PER_REPORT = 4.0
 _SILENCES_PER_LIFE = 4.0
 #: Largest acceleration across the direction of travel of anything but aircraft: a race car's is 30 m/s^2.
 _LARGEST_TURN_MPS2 = 30.0
+#: Widest interval of a standard deviation that counts, as a share of it, and least share of the usual value.
+_WIDEST = 0.3
+_LEAST_OF_USUAL = 0.1
 _LEAST_CLUTTER = 0.05
 """Smallest assumed number of false detections in a list; fewer cannot be excluded."""
 #: Share of time-correlated errors in the variance: smaller shares are not modelled, larger ones are limited.
@@ -194,6 +199,8 @@ def _covered(
     result = {name: Coverage() for name in named.difference(config.ignore_sensors)}
     result |= coverages(readable(), mounts)
     contrary = uninformative(first, mounts)
+    points, _ = points_of(first, config.ego.detection_origin_m)
+    unmodelled = unmodelled_sensors(config, result)
     for name, one in result.items():
         # Reports of an object decide on its velocities, where they are linked.
         linked = one.reports
@@ -201,8 +208,14 @@ def _covered(
         if linked is not None:
             untested = reasons.keys() - linked.std.keys()
             reasons = {key: reasons[key] for key in untested} | linked.uninformative
+        scatter: Mapping[str, Scatter] = {}
+        if name in unmodelled and name in points and linked is None:
+            scatter = scattered_noise(points[name])
         result[name] = replace(
-            one, measured=one.measured - reasons.keys(), uninformative=reasons
+            one,
+            measured=one.measured - reasons.keys(),
+            uninformative=reasons,
+            scatter=scatter,
         )
     return dict(sorted(result.items()))
 
@@ -296,7 +309,7 @@ def _heading_age_s(reports: SingleReports) -> float:
     """
     speed_mps = max(reports.speed_mps, 1.0)
     density = MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ
-    std_m = max(reports.along.std_m, reports.across.std_m)
+    std_m = max(reports.along.std, reports.across.std)
     sixth_power = 36.0 * std_m**2 * reports.period_s / (speed_mps**2 * density)
     return math.pow(sixth_power, 1.0 / 6.0)
 
@@ -321,7 +334,7 @@ def _report_ticks(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield usual standard deviations of the sensors, or larger ones that single reports show."""
+    """Yield standard deviations of the sensors: from the scatter, from single reports, or usual ones."""
     cartesian = {"x_m", "y_m"}
     for name, item in covered.items():
         redundant = (
@@ -338,7 +351,12 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
         }
         reason = USUAL_BOX if item.boxes else USUAL
         growth: dict[str, float] = {}
-        if item.reports is not None:
+        if _shows_noise(item):
+            std, growth, shown = _of_scatter(std, item)
+            unshown = [component for component in std if component not in shown]
+            usual_words = f"{', '.join(unshown)}: {reason}" if unshown else ""
+            reason = "; ".join(filter(None, [_scatter_words(shown), usual_words]))
+        elif item.reports is not None:
             std, growth = _of_reports(std, item.reports)
             reason = (
                 f"scatter of {item.reports.num_triples} triples of reports of an object, "
@@ -356,6 +374,53 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
         )
 
 
+def _shows_noise(one: Coverage) -> bool:
+    """True if the scatter of a sensor shows its noise.
+
+    It does not where sensors disagree by more, because their errors are correlated in
+    time. So are the errors of boxes, unless another sensor agrees with them.
+    """
+    is_compared = one.disagreement_m is not None
+    return bool(one.scatter) and not _is_common(one) and (is_compared or not one.boxes)
+
+
+def _of_scatter(
+    usual: Mapping[str, float], one: Coverage
+) -> tuple[dict[str, float], dict[str, float], dict[str, Scatter]]:
+    """Return standard deviations, their growth with the range, and the scatter of the components that it shows.
+
+    Half of the variance that the scatters of two sensors leave unexplained counts for
+    each. Standard deviations are at least a tenth of the usual ones, because tracks
+    have errors of the mounts, of the ego and of the motion, too.
+    """
+    shown = {
+        name: each
+        for name, each in one.scatter.items()
+        if name in usual and each.half_width <= _WIDEST
+    }
+    std = dict(usual)
+    growth: dict[str, float] = {}
+    for name, each in shown.items():
+        is_length = name in ("x_m", "y_m", "range_m")
+        more = one.unexplained_m / math.sqrt(2.0) if is_length else 0.0
+        least = _LEAST_OF_USUAL * usual[name]
+        std[name] = float(f"{max(math.hypot(each.noise.std, more), least):.2g}")
+        if each.noise.growth:
+            growth[name] = float(f"{each.noise.growth:.2g}")
+    return std, growth, shown
+
+
+def _scatter_words(shown: Mapping[str, Scatter]) -> str:
+    """Return the scatters and their 95 % intervals in words."""
+    if not shown:
+        return ""
+    parts = [
+        f"{name} +- {100.0 * each.half_width:.0f} %" for name, each in shown.items()
+    ]
+    count = max(each.num_triples for each in shown.values())
+    return f"scatter of {count} triples of detections around straight lines, {', '.join(parts)}"
+
+
 def _of_reports(
     usual: Mapping[str, float], reports: SingleReports
 ) -> tuple[dict[str, float], dict[str, float]]:
@@ -366,10 +431,10 @@ def _of_reports(
         along, across = reports.along, reports.across
         if along.growth == across.growth == 0.0:
             measured["x_m"] = measured["y_m"] = math.hypot(
-                along.std_m, across.std_m
+                along.std, across.std
             ) / math.sqrt(2.0)
         else:
-            measured |= {"x_m": along.std_m, "y_m": across.std_m}
+            measured |= {"x_m": along.std, "y_m": across.std}
             trends = {"x_m": along.growth, "y_m": across.growth}
             growth = {
                 key: float(f"{value:.2g}") for key, value in trends.items() if value

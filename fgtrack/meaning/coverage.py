@@ -27,6 +27,7 @@ from fgtrack.meaning.persistence import (
     disagreement_m,
     persistence,
 )
+from fgtrack.meaning.scattered_noise import Scatter
 from fgtrack.meaning.single_reports import NO_ID, SingleReports, single_reports
 from fgtrack.models.sensors import Mount
 
@@ -112,6 +113,8 @@ class Coverage:
     """Persistence of the detections from list to list; None if too few recur."""
     reports: SingleReports | None = None
     """Objects of a sensor that reports them one by one; None for a sensor that scans, or with too few reports."""
+    scatter: Mapping[str, Scatter] = field(default_factory=dict)
+    """Noise of the components by the scatter of the detections of objects around straight lines."""
     disagreement_m: float | None = None
     """Smallest standard deviation between positions of this and another sensor; None without common objects."""
     unexplained_m: float = 0.0

@@ -6,14 +6,14 @@ or by their distance. The period of an object is then the time between its repor
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.meaning.scatter import MAD, Trend, line_errors, sight_errors
 
-__all__ = ["NO_ID", "SingleReports", "Trend", "links_of_ids", "single_reports"]
+__all__ = ["NO_ID", "SingleReports", "links_of_ids", "single_reports"]
 
 NO_ID = -1
 """Number of a report without an identity."""
@@ -36,8 +36,6 @@ _LINK_PERIODS = (0.5, 1.5)
 _LONGEST_PERIODS = 2.5
 #: Quantile of the times between the reports of an object that counts as its longest usual silence.
 _SILENCE = 0.9
-#: Ratio of a median absolute deviation and a standard deviation.
-_MAD = 0.6745
 #: Ratio of the scatters at far and near ranges from which the scatter grows with the range.
 _GROWING = 1.25
 #: Smallest scatter at far ranges from which a growth is estimated.
@@ -47,13 +45,6 @@ _CLEAR = 5.0
 #: Reported headings and speeds with larger errors, in rad and as a share of the speed, are no measurements.
 _LARGEST_YAW_RAD = 0.5
 _LARGEST_SPEED_SHARE = 0.5
-
-
-class Trend(NamedTuple):
-    """Standard deviation of a position at range r: sqrt(std_m^2 + (growth r)^2)."""
-
-    std_m: float
-    growth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -209,15 +200,8 @@ def _noise(
 
     Shapes (m, 3), (m, 3, 2) and (m, 3, 2). The median ignores objects that turn.
     """
-    span_s = times_s[:, 2] - times_s[:, 0]
-    share = (times_s[:, 1] - times_s[:, 0]) / span_s
-    weights = np.column_stack([share - 1.0, np.ones(len(share)), -share])
-    rest_m = np.einsum("mt,mtc->mc", weights, points_m)
-    rest_m /= np.sqrt(np.square(weights).sum(axis=1))[:, None]
-    ranges_m = np.hypot(*sights_m[:, 1].T)
-    sight = sights_m[:, 1] / np.maximum(ranges_m, 1e-9)[:, None]
-    along_m = np.einsum("mc,mc->m", rest_m, sight)
-    across_m = sight[:, 0] * rest_m[:, 1] - sight[:, 1] * rest_m[:, 0]
+    rest_m = line_errors(times_s, points_m)
+    along_m, across_m, ranges_m = sight_errors(rest_m, sights_m[:, 1])
     return _trend(along_m, ranges_m), _trend(across_m, ranges_m)
 
 
@@ -242,7 +226,7 @@ def _trend(rest_m: FloatArray, ranges_m: FloatArray) -> Trend:
 
 
 def _std(values: FloatArray) -> float:
-    return float(np.median(np.abs(values))) / _MAD
+    return float(np.median(np.abs(values))) / MAD
 
 
 def _compare_velocities(
@@ -255,13 +239,13 @@ def _compare_velocities(
     span_s = times_s[:, 2] - times_s[:, 0]
     moved_m = points_m[:, 2] - points_m[:, 0]
     distances_m = np.hypot(*moved_m.T)
-    clear_m = _CLEAR * max(result.along.std_m, result.across.std_m, 0.2)
+    clear_m = _CLEAR * max(result.along.std, result.across.std, 0.2)
     yaw_rad = velocities[:, 0]
     turned = np.isfinite(yaw_rad) & (distances_m > clear_m)
     if turned.sum() >= _FEWEST:
         course_rad = np.arctan2(moved_m[:, 1], moved_m[:, 0])
         off_rad = np.abs(wrap_angles(yaw_rad[turned] - course_rad[turned]))
-        std_rad = float(np.median(off_rad)) / _MAD
+        std_rad = float(np.median(off_rad)) / MAD
         if std_rad > _LARGEST_YAW_RAD:
             result.uninformative["yaw_rad"] = (
                 f"it differs by {float(np.median(off_rad)):.2g} rad from the direction of travel"

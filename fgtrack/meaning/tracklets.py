@@ -9,14 +9,13 @@ tracklets.
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fgtrack.core.geometry import rotations
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
-    BoolArray,
     Detection,
     DetectionList,
     EgoState,
@@ -24,12 +23,23 @@ from fgtrack.core.types import (
     IntArray,
     Message,
 )
+from fgtrack.meaning.scatter import Trend, growing, line_errors, sight_errors
 
-__all__ = ["EgoMotion", "Noise", "Points", "points_of", "tracklets"]
+__all__ = [
+    "EgoMotion",
+    "Noise",
+    "Points",
+    "points_of",
+    "sights_m",
+    "tracklets",
+    "triples",
+]
 
 #: Time from the first message that is evaluated, and most detections of a sensor.
 LONGEST_S = 90.0
 _MOST = 20_000
+#: Components beside the position.
+_VALUES = ("yaw_rad", "speed_mps", "range_rate_mps")
 #: Highest speed of an object relative to the ego.
 _FASTEST_MPS = 70.0
 #: Most lists in which the object of a tracklet may be missing, plus 1.
@@ -41,7 +51,7 @@ _LARGEST_MISFIT = 13.8
 #: Largest acceleration relative to the ego, as a standard deviation.
 _ACCEL_MPS2 = 4.0
 #: Standard deviations before they are estimated: [m], and a share of the range; along and across the line of sight.
-_USUAL = ((0.5, 0.03), (0.4, 0.015))
+_USUAL = (Trend(0.5, 0.03), Trend(0.4, 0.015))
 _SMALLEST_M = 0.02
 _FEWEST_TRIPLES = 40
 
@@ -50,14 +60,14 @@ _FEWEST_TRIPLES = 40
 class Noise:
     """Variances of a sensor's positions along and across the line of sight: a^2 + (b range)^2."""
 
-    along: tuple[float, float] = _USUAL[0]
-    """Standard deviation in m at range 0, and its growth with the range."""
-    across: tuple[float, float] = _USUAL[1]
+    along: Trend = _USUAL[0]
+    across: Trend = _USUAL[1]
 
     def variances(self, ranges_m: FloatArray) -> FloatArray:
         """Return the variances along and across, shape (..., 2), at `ranges_m` (...)."""
         return np.stack(
-            [a**2 + (b * ranges_m) ** 2 for a, b in (self.along, self.across)], axis=-1
+            [np.square(each.at(ranges_m)) for each in (self.along, self.across)],
+            axis=-1,
         )
 
     def covariances(self, sights_m: FloatArray) -> FloatArray:
@@ -112,6 +122,8 @@ class Points:
     """Poses of the ego at the stamps, shape (n, 3); NaN where unknown."""
     is_polar: bool
     """True if the sensor measures ranges and bearings."""
+    values: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Other components by name, each of shape (n,); NaN where missing."""
 
     @property
     def turned_m(self) -> FloatArray:
@@ -123,15 +135,7 @@ class Points:
 
     def read_in_map(self, in_map: bool) -> "Points":
         """Return the same numbers, read as positions in the map, or in the frame of the ego or the sensor."""
-        return Points(
-            self.sensor,
-            self.stamps_s,
-            self.lists,
-            self.points_m,
-            in_map,
-            self.poses,
-            self.is_polar,
-        )
+        return replace(self, in_map=in_map)
 
 
 def points_of(
@@ -143,7 +147,7 @@ def points_of(
     and sensors with detections in several frames, are left out.
     """
     ego: list[tuple[float, float, float, float]] = []
-    rows = defaultdict[str, list[tuple[float, int, float, float]]](list)
+    rows = defaultdict[str, list[tuple[float, ...]]](list)
     frames = defaultdict[str, set[str]](set)
     polar = set[str]()
     counts = defaultdict[str, int](int)
@@ -166,7 +170,10 @@ def points_of(
                     continue
                 polar |= {name} if item.x_m is None else set()
                 own_ns = item.stamp_ns or message.stamp_ns
-                rows[name].append(((own_ns - first_ns) / NS_PER_S, number, *at_m))
+                values = (getattr(item, each) for each in _VALUES)
+                known = (math.nan if each is None else each for each in values)
+                own_s = (own_ns - first_ns) / NS_PER_S
+                rows[name].append((own_s, number, *at_m, *known))
     motion = EgoMotion(np.array(ego).reshape(-1, 4))
     if motion and any(origin_m):
         motion.rows[:, 1:3] += rotations(motion.rows[:, 3]) @ np.array(origin_m)
@@ -183,7 +190,10 @@ def points_of(
 def _points(
     name: str, table: FloatArray, in_map: bool, is_polar: bool, motion: EgoMotion
 ) -> Points:
-    """Return the points in `table` (stamp, list, x, y), with the lists in the order of their stamps."""
+    """Return the points in `table`, with the lists in the order of their stamps.
+
+    The columns are the stamp, the list, x, y and `_VALUES`.
+    """
     lists = table[:, 1].astype(np.int64)
     means_s = np.bincount(lists, table[:, 0]) / np.maximum(np.bincount(lists), 1)
     ranks = np.argsort(np.argsort(means_s, kind="stable"), kind="stable")
@@ -192,14 +202,16 @@ def _points(
     poses = motion.poses(table[:, 0])
     known = np.ones(len(table), dtype=bool) if in_map else np.isfinite(poses[:, 0])
     order = np.sort(numbers)[known]
+    table = table[known]
     return Points(
         name,
-        table[known, 0],
+        table[:, 0],
         order.astype(np.int64),
-        table[known, 2:4],
+        table[:, 2:4],
         in_map,
         poses[known],
         is_polar,
+        dict(zip(_VALUES, table[:, 4:].T, strict=True)),
     )
 
 
@@ -231,7 +243,7 @@ def tracklets(points: Points) -> tuple[IntArray, Noise]:
     return chains, _noise(points, chains, noise)
 
 
-def _sights_m(points: Points) -> FloatArray:
+def sights_m(points: Points) -> FloatArray:
     """Return the vectors from the ego or the sensor to the detections, in the axes of the tracklets, shape (n, 2)."""
     if not points.in_map:
         return points.turned_m
@@ -244,7 +256,7 @@ def _chains(points: Points, noise: Noise) -> IntArray:
     """Return the tracklet of each detection, shape (n,); -1 for none."""
     at_m = points.turned_m
     count = len(at_m)
-    R = noise.covariances(_sights_m(points))
+    R = noise.covariances(sights_m(points))
     times_s = points.stamps_s
     begins, ends = _edges(points, at_m)
     # Triples: an edge that ends in a detection, and an edge that begins in it.
@@ -316,45 +328,24 @@ def _numbered(following: IntArray, previous: IntArray) -> IntArray:
 
 def _noise(points: Points, chains: IntArray, usual: Noise) -> Noise:
     """Estimate the noise from the second differences of the tracklets; `usual` if there are few."""
+    rows = triples(points, chains)
+    if len(rows) < _FEWEST_TRIPLES:
+        return usual
+    errors_m = line_errors(points.stamps_s[rows], points.turned_m[rows])
+    along_m, across_m, ranges_m = sight_errors(errors_m, sights_m(points)[rows[:, 1]])
+    return Noise(
+        growing(along_m, ranges_m, _SMALLEST_M),
+        growing(across_m, ranges_m, _SMALLEST_M),
+    )
+
+
+def triples(points: Points, chains: IntArray, lag: int = 1) -> IntArray:
+    """Return the rows of three detections of a tracklet, each `lag` detections after the other, shape (n, 3)."""
     order = np.lexsort((points.stamps_s, chains))
     order = order[chains[order] >= 0]
-    same = chains[order[2:]] == chains[order[:-2]]
-    i, j, k = (order[n : len(order) - 2 + n][same] for n in range(3))
-    if len(j) < _FEWEST_TRIPLES:
-        return usual
-    at_m = points.turned_m
-    times_s = points.stamps_s
-    share = (times_s[k] - times_s[j]) / (times_s[k] - times_s[i])
-    misfit_m = at_m[j] - share[:, None] * at_m[i] - (1.0 - share)[:, None] * at_m[k]
-    sights_m = _sights_m(points)[j]
-    ranges_m = np.hypot(*sights_m.T)
-    u = sights_m / np.maximum(ranges_m, 1e-6)[:, None]
-    gain = np.sqrt(1.0 + np.square(share) + np.square(1.0 - share))
-    along_m = np.einsum("ni,ni->n", misfit_m, u) / gain
-    across_m = (u[:, 0] * misfit_m[:, 1] - u[:, 1] * misfit_m[:, 0]) / gain
-    return Noise(_growing(along_m, ranges_m), _growing(across_m, ranges_m))
-
-
-def _growing(errors_m: FloatArray, ranges_m: FloatArray) -> tuple[float, float]:
-    """Fit a and b of the standard deviation sqrt(a^2 + (b range)^2) to `errors_m`, by medians in groups of ranges."""
-    from scipy.optimize import nnls
-
-    groups = np.array_split(np.argsort(ranges_m, kind="stable"), 6)
-    stds_m = np.array([np.median(np.abs(errors_m[rows])) / 0.6745 for rows in groups])
-    stds_m = np.maximum(stds_m, _SMALLEST_M)
-    square_m2 = np.array([np.mean(np.square(ranges_m[rows])) for rows in groups])
-    # Relative errors count, because the variances differ by orders of magnitude.
-    A = np.column_stack([np.ones(len(groups)), square_m2]) / np.square(stds_m)[:, None]
-    a, b = np.sqrt(nnls(A, np.ones(len(groups)))[0])
-    return max(float(a), _SMALLEST_M), float(b)
-
-
-def lengths_of(chains: IntArray) -> Mapping[int, int]:
-    """Return the number of detections of each tracklet."""
-    numbers, counts = np.unique(chains[chains >= 0], return_counts=True)
-    return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-
-
-def in_tracklets(chains: IntArray) -> BoolArray:
-    """Mask of the detections in tracklets, shape (n,)."""
-    return np.asarray(chains >= 0)
+    rows = np.column_stack(
+        [order[: -2 * lag], order[lag:-lag], order[2 * lag :]]
+        if len(order) > 2 * lag
+        else [order[:0]] * 3
+    )
+    return np.asarray(rows[chains[rows[:, 0]] == chains[rows[:, 2]]])

@@ -82,8 +82,8 @@ def test_the_noise_of_a_rotating_radar_grows_across_the_line_of_sight(
     reports = coverage(rotating(4.0, identified=identified)).reports
     assert reports is not None
     assert reports.along.growth == 0.0
-    assert reports.along.std_m == pytest.approx(40.0, rel=0.15)
-    at_50_km_m = math.hypot(reports.across.std_m, 50e3 * reports.across.growth)
+    assert reports.along.std == pytest.approx(40.0, rel=0.15)
+    at_50_km_m = math.hypot(reports.across.std, 50e3 * reports.across.growth)
     assert at_50_km_m == pytest.approx(60.0, rel=0.2)
 
 
