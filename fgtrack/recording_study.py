@@ -15,6 +15,8 @@ from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import REPLAY, PairedReplay
 from fgtrack.config.reading import ConfigLike, read_config
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import (
     check_no_overlap,
@@ -33,7 +35,10 @@ from fgtrack.inputs.errors import UntilBreak
 from fgtrack.meaning.assumption import Assumed
 from fgtrack.meaning.draft import drafted
 from fgtrack.noise.measurements import MeasurementRecorder
+from fgtrack.pipeline.recording_jobs import scored
 from fgtrack.pipeline.replay import replay
+from fgtrack.pipeline.sweep import Cell, Score, failure
+from fgtrack.pipeline.sweep_plan import Recipe
 from fgtrack.runs import Run, check_run, load_run, write_metrics
 from fgtrack.show.figures.close_up import CloseUp
 from fgtrack.show.figures.late_detection import drawn_close_up
@@ -122,6 +127,26 @@ def _percent(mask: Any) -> str:  # Any: an array of bool
 
 def _several(count: int, what: str, ending: str = "s") -> str:
     return f"{count or 'no'} {what}{'' if count == 1 else ending}"
+
+
+def study_job(key: str, recipe: Recipe, score: Score) -> tuple[str, tuple[Cell, ...]]:
+    """Study the recording of `recipe` in its folder, and return `key` and a cell for each estimator.
+
+    An exception becomes the error of a cell. The settings of the recipe are not
+    changed by advice, so they are the same for all recordings.
+    """
+    try:
+        found = study(
+            recipe["recording"],
+            recipe["folder"],
+            validate(Config, recipe["config"], "config"),
+            advice=False,
+            overwrite=True,
+        )
+        cells = tuple(scored(run, score) for run in found.runs)
+    except (Exception, SystemExit) as error:  # one failed study must not end the others
+        return key, tuple(Cell(name, {}, {}, failure(error)) for name in ESTIMATORS)
+    return key, tuple(replace(cell, problem=found.problem) for cell in cells)
 
 
 ESTIMATORS = ("smoother", REPLAY, "ekf-backward-forward")

@@ -15,6 +15,13 @@ Input = Annotated[
         help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
     ),
 ]
+Inputs = Annotated[
+    list[Path],
+    Argument(
+        metavar="INPUT...",
+        help="Recordings, or a folder: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
+    ),
+]
 ConfigFile = Annotated[
     str | None,
     Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name."),
@@ -41,6 +48,13 @@ Reference = Annotated[
     Option(
         "--reference", help="Sensor with the correct clock, if two sensors disagree."
     ),
+]
+Jobs = Annotated[
+    int | None,
+    Option(min=1, help="Number of processes; default: one for each core."),
+]
+Dask = Annotated[
+    str | None, Option(metavar="ADDRESS", help="Address of a dask cluster.")
 ]
 Runs = Annotated[
     list[Path],

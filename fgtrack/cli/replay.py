@@ -1,6 +1,7 @@
 """`fgtrack replay`: runs a recording through the tracker into run folders."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,9 @@ from typer import Option
 
 from fgtrack.cli.arguments import (
     ConfigFile,
-    Input,
+    Dask,
+    Inputs,
+    Jobs,
     Overwrite,
     PitMap,
     Settings,
@@ -16,6 +19,7 @@ from fgtrack.cli.arguments import (
     TrackMap,
     TruthOption,
 )
+from fgtrack.cli.recording_folders import Folder, listed
 from fgtrack.cli.show import progress, say, warn
 from fgtrack.config.reading import read_config
 from fgtrack.config.shipped import suited_reports
@@ -32,17 +36,18 @@ from fgtrack.evaluation.diagnostics import (
 )
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
+from fgtrack.pipeline.recording_jobs import replay_job
 from fgtrack.runs import load_run
 
 
 def replay(
-    recording: Input,
+    recordings: Inputs,
     out: Annotated[
         Path,
         Option(
             "-o",
             "--out",
-            help="Run folder; several estimators: one subfolder for each.",
+            help="Run folder; several recordings or estimators: one subfolder for each.",
         ),
     ],
     config_file: ConfigFile = None,
@@ -55,16 +60,30 @@ def replay(
     settings: Settings = None,
     table_format: TableFormatOption = "csv",
     truth: TruthOption = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker.
 
     Each estimator processes the recording from its start, and its results are written
-    to a run folder.
+    to a run folder. Several recordings, or a folder, are replayed with the same
+    settings, and a table shows the worst recordings first.
     """
-    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
+    read = partial(read_config, settings=settings, track_map=track_map, pit_map=pit_map)
+    config = read(config_file)
     given = (config.estimator if estimators is None else estimators).split(",")
     names = tuple(dict.fromkeys(ESTIMATORS.resolve(name.strip()) for name in given))
+    several = listed(recordings, config)
+    if len(several) > 1:
+        every = Folder(several, out, jobs, dask, overwrite)
+        config_file = every.config_file(config_file)
+        config = read(config_file)
+        config = every.confirmed(config, config_file is not None)
+        formats = {"table_format": table_format, "truth": truth}
+        every.run(config, names, replay_job, formats, "")
+        return
+    [recording] = several.values()
     folders = (
         {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
     )

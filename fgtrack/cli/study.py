@@ -1,8 +1,8 @@
 """`fgtrack study` and `demo`: from a recording, or a simulated race, to a report in one command."""
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,17 +11,20 @@ from typer import Argument, Option
 
 from fgtrack.cli.arguments import (
     ConfigFile,
+    Dask,
+    Jobs,
     Overwrite,
     PitMap,
     Seed,
     Settings,
     TrackMap,
 )
+from fgtrack.cli.recording_folders import Folder, listed
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.settings import Config
-from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_no_overlap, locked_folder
 from fgtrack.evaluation.diagnostics import (
     diagnostics,
@@ -33,7 +36,7 @@ from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import with_origin
 from fgtrack.pipeline.simulation import simulated
-from fgtrack.recording_study import Study, outputs
+from fgtrack.recording_study import ESTIMATORS, Study, outputs, study_job
 from fgtrack.recording_study import study as studied
 from fgtrack.show.figures.plot import error_against_delay
 
@@ -43,7 +46,7 @@ def study(
         list[Path],
         Argument(
             metavar="INPUT...",
-            help="Recordings of one vehicle: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
+            help="Recordings of one vehicle, or a folder: rosbag2, .mcap, .db3, .bag, stream, CSV or data set.",
         ),
     ],
     out: Annotated[
@@ -58,6 +61,8 @@ def study(
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Read a recording, replay three estimators, compare, report.
@@ -65,12 +70,21 @@ def study(
     No configuration is needed. Assumptions are printed with their reasons, and written
     to settings.yaml. Change this file and run the command again. The settings hold for
     other recordings of the vehicle.
+
+    Of several recordings, or a folder, each is studied with the same settings, and a
+    table shows the worst recordings first. Finished recordings are kept.
     """
-    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
-    if len(recordings) > 1:
-        _study_each(recordings, out, config, config_file, overwrite)
+    read = partial(read_config, settings=settings, track_map=track_map, pit_map=pit_map)
+    config = read(config_file)
+    several = listed(recordings, config)
+    if len(several) > 1:
+        every = Folder(several, out, jobs, dask, overwrite)
+        config_file = every.config_file(config_file)
+        config = read(config_file)
+        config = every.confirmed(config, config_file is not None)
+        every.run(config, ESTIMATORS, study_job, {"kind": "study"}, "report.html")
         return
-    [recording] = recordings
+    [recording] = several.values()
     result = _studied(recording, out, config, config_file, overwrite)
     for line in dict.fromkeys(
         str(item) for run in result.runs for item in diagnostics(run)
@@ -90,51 +104,6 @@ def _studied(
         check_no_overlap(path, [recording, config_file])
     with progress("study") as tell:
         return studied(recording, out, config, overwrite=overwrite, on_step=tell)
-
-
-def _study_each(
-    recordings: Sequence[Path],
-    out: Path,
-    config: Config,
-    config_file: str | None,
-    overwrite: bool,
-) -> None:
-    """Study each recording in its own folder, and print a line for each.
-
-    Raises `DataError` at the end if a recording has an error or an open question.
-    """
-    failed = 0
-    for recording, folder in zip(recordings, _folders(recordings, out), strict=True):
-        try:
-            found = _studied(recording, folder, config, config_file, overwrite)
-            problem = _problem(found, recording)
-            line = f"{folder.name}: {found.report}; {found.summary[1]}"
-        except FgtrackError as error:
-            problem = str(error)
-            line = f"{folder.name}: no study"
-        failed += problem is not None
-        say(f"{line}{'' if problem is None else f' error: {problem}'}")
-    if failed:
-        raise DataError(
-            f"{failed} of {len(recordings)} recordings have an error or an open question"
-        )
-
-
-def _folders(recordings: Sequence[Path], out: Path) -> list[Path]:
-    """Return a folder in `out` for each recording: its name, with the ending if names are equal otherwise.
-
-    Raises `CallError` for equal names.
-    """
-    stems = [
-        path.name if path.is_dir() else path.name.split(".")[0] for path in recordings
-    ]
-    names = [
-        stem if stems.count(stem) == 1 else path.name
-        for path, stem in zip(recordings, stems, strict=True)
-    ]
-    if len(set(names)) < len(names):
-        raise CallError("two recordings have the same name: study them one by one")
-    return [out / name for name in names]
 
 
 def show_study(found: Study, recording: Path) -> None:

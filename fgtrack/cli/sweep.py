@@ -5,7 +5,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
+from fgtrack.cli.arguments import All, Dask, Form, FormOption, Jobs, Overwrite, Settings
 from fgtrack.cli.show import progress, say, show
 from fgtrack.config.shipped import find_file
 from fgtrack.core.errors import DataError
@@ -37,13 +37,8 @@ def sweep(
         Path,
         Option("-o", "--out", help="Folder of the tables; finished jobs are kept."),
     ],
-    jobs: Annotated[
-        int | None,
-        Option(min=1, help="Number of processes; default: one for each core."),
-    ] = None,
-    dask: Annotated[
-        str | None, Option(metavar="ADDRESS", help="Address of a dask cluster.")
-    ] = None,
+    jobs: Jobs = None,
+    dask: Dask = None,
     recording: Annotated[
         Path | None,
         Option(

@@ -44,9 +44,9 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Return `runs` with unique labels.
 
-    A path is a run folder, or a folder with run folders, at most one level deeper.
-    These are sorted by name. The keys of a mapping are labels. Raises `CallError` if
-    there is no run, and `DataError` for a damaged run.
+    A path is a run folder, or a folder with run folders, at most two levels deeper, as
+    in the study of several recordings. These are sorted by name. The keys of a mapping
+    are labels. Raises `CallError` if there is no run, and `DataError` for a damaged run.
     """
     every = _flat(runs)
     if any(isinstance(item, Run) for item in every):
@@ -160,7 +160,7 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
             )
         return [item for entry in given for item in _flat(entry)]
     path = Path(given)
-    for pattern in ("", "*", "*/*") if path.is_dir() else ():
+    for pattern in ("", "*", "*/*", "*/*/*") if path.is_dir() else ():
         if folders := [
             each
             for each in (sorted(path.glob(pattern)) if pattern else [path])

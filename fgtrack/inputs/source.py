@@ -1,6 +1,6 @@
 """Opens an input (recording, stream or data set) and recognises its format by the content."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,14 @@ class FileFormat:
     """Opens the input at a path: returns `InputSource.messages`, raises the exceptions of `open_input`."""
     settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
     """Returns the settings that the input at a path carries, as `InputSource.settings`."""
+    recordings: Callable[[Path, InputConfig], Sequence[Path]] = lambda path, config: (
+        path,
+    )
+    """Returns the paths of the recordings in a folder of this format."""
+    files: Callable[[Path], Iterable[Path]] = lambda path: (
+        path.rglob("*") if path.is_dir() else (path,)
+    )
+    """Returns the paths of all files of the recording at a path; there may be folders among them."""
     validates: bool = False
     """True if the reader itself validates every message with `validated_message`."""
 

@@ -1,6 +1,5 @@
 """A sweep of settings, seeds and estimators whose runs are scored by their metrics: `fgtrack.sweep`."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +8,8 @@ from fgtrack.config.shipped import find_file
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_no_overlap
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.pipeline.sweep import ERROR_TABLE, PRODUCTS, SWEEP_TABLE, Scalar, Sweep
+from fgtrack.evaluation.scalars import Scalar, scalars_of
+from fgtrack.pipeline.sweep import ERROR_TABLE, PRODUCTS, SWEEP_TABLE, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.runs import Run
 
@@ -63,21 +63,8 @@ def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
     """Return all scalars of the metrics of `run` by path, and its wall times."""
     scalars = {
         name: value
-        for name, value in _scalars(evaluate(run).as_dict(), "")
+        for name, value in scalars_of(evaluate(run))
         if name not in ("name", "estimator")
     }
     times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
     return {name: value for name, value in scalars.items() if name not in times}, times
-
-
-def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:
-    """Path and value of every scalar; entries of a list with a lag are named by it."""
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            yield from _scalars(entry, f"{path}.{name}" if path else name)
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        for index, entry in enumerate(value):
-            name = entry.get("lag_s", index) if isinstance(entry, Mapping) else index
-            yield from _scalars(entry, f"{path}.{name}")
-    elif value is None or isinstance(value, (str, int, float)):
-        yield path, value

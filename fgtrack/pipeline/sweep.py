@@ -24,6 +24,7 @@ from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.output import check_output, locked_folder, write_file
 from fgtrack.core.types import Message
+from fgtrack.evaluation.scalars import Scalar
 from fgtrack.meaning.assumed import assumed
 from fgtrack.meaning.draft import opened
 from fgtrack.pipeline.replay import replay_in_memory
@@ -48,7 +49,6 @@ _WATCH_S = 1.0
 _HANDED_OUT = 2
 _logger = logging.getLogger(__name__)
 
-Scalar = str | bool | int | float | None
 #: Function that returns reproducible metrics and wall times of a run, by column. Other processes must be able to import
 #: the function.
 Score = Callable[[Run], tuple[Mapping[str, Scalar], Mapping[str, Scalar]]]
@@ -69,6 +69,9 @@ class Cell:
     """Line on open questions about the recording, whose sensors are left out; None without such questions."""
 
 
+_Result = tuple[str, Sequence[Cell]]
+#: Function that returns key and cells of a job. Other processes must be able to import the function.
+Work = Callable[[str, Recipe, Score], _Result]
 _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="forbid"))
 
 
@@ -140,21 +143,22 @@ class Sweep:
         jobs: int = -1,
         dask: str | None = None,
         on_job: Callable[[], None] = lambda: None,
+        work: Work | None = None,
     ) -> SweepResult:
         """Run the remaining jobs, store each finished job, and write the tables, even if interrupted.
 
-        `jobs` is the number of processes, -1 means one for each core. `dask` is the
-        address of a scheduler to use instead. Raises `CallError` if dask or the
-        scheduler is missing, `DataError` if a process dies.
+        `work` runs a job; the default is `run_job`. `jobs` is the number of processes,
+        -1 means one for each core. `dask` is the address of a scheduler to use instead.
+        Raises `CallError` if dask or the scheduler is missing, `DataError` if a process
+        dies.
         """
         tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
+        given = (tasks, score, work or run_job)
         with locked_folder(self.folder):
             (self.folder / _PARTS).mkdir(exist_ok=True)
             try:
                 for key, cells in (
-                    _local(tasks, score, jobs)
-                    if dask is None
-                    else _on_cluster(tasks, score, dask)
+                    _local(*given, jobs) if dask is None else _on_cluster(*given, dask)
                 ):
                     write_file(
                         self.folder / _PARTS / f"{key}.json",
@@ -255,7 +259,7 @@ def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
             ).config
     except (Exception, SystemExit) as error:  # one failed job must not end the sweep
         return key, [
-            Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]
+            Cell(name, {}, {}, failure(error)) for name in recipe["estimators"]
         ]
     return key, [
         replace(
@@ -272,11 +276,11 @@ def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
             raise DataError(str(run.meta["broken_off"]))
         values, times = score(run)
     except (Exception, SystemExit) as error:  # as in `run_job`
-        return Cell(config.estimator, {}, {}, _reason(error))
+        return Cell(config.estimator, {}, {}, failure(error))
     return Cell(config.estimator, values, {"replay_s": run.meta["wall_s"], **times})
 
 
-def _reason(error: BaseException) -> str:
+def failure(error: BaseException) -> str:
     """Message of an error on one line; the error's type is added if it is a bug."""
     text = " ".join(str(error).split())
     return (
@@ -284,10 +288,9 @@ def _reason(error: BaseException) -> str:
     )
 
 
-_Result = tuple[str, Sequence[Cell]]
-
-
-def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Result]:
+def _local(
+    tasks: Mapping[str, Recipe], score: Score, work: Work, jobs: int
+) -> Iterator[_Result]:
     """Yield results from processes on this machine, as they finish."""
     # With several processes, several BLAS threads in each would only wait for each other.
     settings = {
@@ -298,7 +301,7 @@ def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Re
     with joblib.parallel_config(
         "loky", n_jobs=joblib.effective_n_jobs(jobs), **settings
     ):
-        yield from _results(tasks, score)
+        yield from _results(tasks, score, work)
 
 
 def _end_with_parent(parent: int) -> None:
@@ -316,7 +319,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 def _on_cluster(
-    tasks: Mapping[str, Recipe], score: Score, address: str
+    tasks: Mapping[str, Recipe], score: Score, work: Work, address: str
 ) -> Iterator[_Result]:
     """Yield results from the workers of a dask cluster, as they finish."""
     try:
@@ -338,10 +341,12 @@ def _on_cluster(
         client,
         joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S),
     ):
-        yield from _results(tasks, score)
+        yield from _results(tasks, score, work)
 
 
-def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
+def _results(
+    tasks: Mapping[str, Recipe], score: Score, work: Work
+) -> Iterator[_Result]:
     """Yield results of the tasks from the selected joblib backend, as they finish."""
     parallel = joblib.Parallel(
         return_as="generator_unordered",
@@ -354,7 +359,7 @@ def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         results: Generator[_Result] = parallel(
-            joblib.delayed(run_job)(*task, score) for task in tasks.items()
+            joblib.delayed(work)(*task, score) for task in tasks.items()
         )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -362,7 +367,7 @@ def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
         yield from results
     except Exception as error:  # jobs report their own errors, so a process, the scheduler or the network failed
         raise DataError(
-            f"the workers failed, perhaps out of memory ({_reason(error):.120}): "
+            f"the workers failed, perhaps out of memory ({failure(error):.120}): "
             "run the sweep once more to continue, perhaps with fewer --jobs"
         ) from error
     finally:

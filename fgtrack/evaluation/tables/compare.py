@@ -22,6 +22,7 @@ from fgtrack.evaluation.scores.innovations import FEWEST, RESIDUAL_NAMES
 from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table, Tables, named
 from fgtrack.evaluation.tables.decisions import decisions_table, revisions_table
+from fgtrack.evaluation.tables.recordings import recording_tables, sweep_of_runs
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
@@ -80,6 +81,8 @@ def compare(
         "revisions": revisions_table(metrics),
         "decisions": decisions_table(metrics),
     }
+    if (sweep := sweep_of_runs(every)) is not None:
+        tables |= recording_tables(sweep)
     more, sentences = streaming_tables(every) if streaming else ({}, [])
     details = {"runs": {label: item.as_dict() for label, item in metrics.items()}}
     return Tables(tables | more, details, (*verdict(metrics, compared), *sentences))

@@ -66,6 +66,8 @@ class SweepTable:
     metrics: tuple[str, ...]
     rows: DataFrame
     """Axes, `seed` and `estimator` as text, and metrics as numbers; NaN for an empty or infinite cell."""
+    repeated: str = "seeds"
+    """Word for the values of the column `seed`, over which means and intervals are computed."""
 
     @property
     def shown_axes(self) -> list[str]:
@@ -199,8 +201,10 @@ def _ranked(
     )
 
 
-def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
-    """Return a table with a row for each comparison and estimator.
+def difference_table(
+    compared: Sequence[SeedComparison], axes: Sequence[str], repeated: str = "seeds"
+) -> Table:
+    """Return a table with a row for each comparison and estimator; `repeated` as in `SweepTable`.
 
     Only the rows of the first metric over several seeds are shown.
     """
@@ -209,7 +213,7 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
             **dict(zip(axes, item.point, strict=True)),
             "metric": item.metric,
             "estimator": entry.name,
-            "seeds": item.seeds,
+            repeated: item.seeds,
         }
         | {
             name: value
@@ -230,16 +234,19 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
         _point_column(points),
         Column("estimator", left=True),
         *entry_columns("mean", "mean"),
-        Column("seeds"),
+        Column(repeated),
     ]
-    notes = ["intervals: t intervals of paired differences over seeds", STANDING_NOTE]
+    notes = [
+        f"intervals: t intervals of paired differences over {repeated}",
+        STANDING_NOTE,
+    ]
     return Table(
         metric_words(first) if first else "",
         records,
         columns,
         keys,
         notes,
-        is_main=lambda row: row["metric"] == first and row["seeds"] > 1,
+        is_main=lambda row: row["metric"] == first and row[repeated] > 1,
     )
 
 
@@ -253,7 +260,7 @@ def summary_table(sweep: SweepTable) -> Table:
     metrics = list(dict.fromkeys((*main, *metrics)))
     groups = sweep.rows.groupby([*sweep.axes, "estimator"], sort=False)[metrics]
     errors = groups.sem().add_suffix(".standard_error")
-    seeds = groups.count().max(axis=1).rename("seeds")
+    seeds = groups.count().max(axis=1).rename(sweep.repeated)
     names = [
         name
         for metric in metrics
@@ -264,6 +271,7 @@ def summary_table(sweep: SweepTable) -> Table:
     records = (
         pd.concat([groups.mean(), errors, halves], axis=1)[names]
         .join(seeds)
+        .copy()  # many columns in pieces would be slow
         .reset_index()
         .to_dict("records")
     )
@@ -281,14 +289,14 @@ def summary_table(sweep: SweepTable) -> Table:
     few, most = int(seeds.min()), int(seeds.max())
     number = f"{few} to {most}" if few < most else str(most)
     notes = [
-        f"mean over {number} seeds, ±: half of the 95 % interval of the mean (t)"
+        f"mean over {number} {sweep.repeated}, ±: half of the 95 % interval of the mean (t)"
         if most > 1
-        else "one seed, so there is no interval"
+        else f"one of the {sweep.repeated}, so there is no interval"
     ]
     return Table(
         "Summary",
         records,
-        [*columns, Column("seeds")],
+        [*columns, Column(sweep.repeated)],
         (*sweep.axes, "estimator"),
         notes,
     )

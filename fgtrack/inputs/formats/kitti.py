@@ -18,7 +18,7 @@ Conventions that the data set does not specify:
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -32,7 +32,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthState
 from fgtrack.inputs.formats.common import reported_as, split
 from fgtrack.inputs.formats.kitti_view import CALIB, OXTS, View, lines_of, read_views
-from fgtrack.inputs.settings import KittiInput
+from fgtrack.inputs.settings import InputConfig, KittiInput
 from fgtrack.inputs.source import FileFormat
 
 _TYPES = (
@@ -203,12 +203,29 @@ def is_sequence(path: Path) -> bool:
     return any((folder / OXTS).glob("*.txt")) and (folder / CALIB).is_dir()
 
 
+def _sequences(path: Path, config: InputConfig) -> Sequence[Path]:
+    """Return the files of `oxts/` in a folder with several sequences of which none is named, else `path`."""
+    if path.is_file() or config.kitti.sequence is not None:
+        return (path,)
+    known = sorted((path / OXTS).glob("*.txt"))
+    return known if len(known) > 1 else (path,)
+
+
+def _files(path: Path) -> Iterator[Path]:
+    """Yield the files of a sequence, or of all sequences in a folder."""
+    if path.is_file():
+        return path.parent.parent.glob(f"*/{path.stem}.txt")
+    return path.glob("*/*.txt")
+
+
 FORMAT = FileFormat(
     "a KITTI tracking folder (oxts/, calib/) or the oxts/NNNN.txt of a sequence in it",
     is_sequence,
     lambda path, config: partial(
         read_sequence, *_folder_and_sequence(path, config.kitti.sequence), config.kitti
     ),
+    recordings=_sequences,
+    files=_files,
 )
 
 
