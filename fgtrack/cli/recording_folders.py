@@ -1,18 +1,17 @@
 """Several recordings in one command: jobs on cores or on a cluster, and tables over the recordings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from fgtrack.cli.show import progress, say, show
 from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.output import check_no_overlap, write_file
 from fgtrack.evaluation.tables import Tables
 from fgtrack.evaluation.tables.recordings import read_errors, recording_tables
 from fgtrack.evaluation.tables.seeds import read_sweep
-from fgtrack.inputs.folders import recordings_in
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline.recording_jobs import has_runs, recordings_plan
 from fgtrack.pipeline.scored_sweep import score
@@ -120,24 +119,3 @@ def _problem(sweep: Sweep, job: Job) -> str | None:
     errors = [f"{_ERROR}{cell.error}" for cell in cells if cell.error is not None]
     open_lines = [cell.problem for cell in cells if cell.problem is not None]
     return next(iter([*errors, *open_lines]), None)
-
-
-def listed(given: Sequence[Path], config: Config) -> dict[str, Path]:
-    """Return the recordings in `given` by name; the folders among them are listed.
-
-    The name is the file's name without its ending, or with it if names are equal
-    otherwise. Raises `CallError` for equal names, and the exceptions of `recordings_in`.
-    """
-    paths = [
-        path
-        for each in given
-        for path in (recordings_in(each, config.input) if len(given) == 1 else (each,))
-    ]
-    stems = [path.name if path.is_dir() else path.name.split(".")[0] for path in paths]
-    names = [
-        stem if stems.count(stem) == 1 else path.name
-        for path, stem in zip(paths, stems, strict=True)
-    ]
-    if len(set(names)) < len(names):
-        raise CallError("two recordings have the same name: give them one by one")
-    return dict(zip(names, paths, strict=True))

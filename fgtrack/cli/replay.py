@@ -19,7 +19,6 @@ from fgtrack.cli.arguments import (
     TrackMap,
     TruthOption,
 )
-from fgtrack.cli.recording_folders import Folder, listed
 from fgtrack.cli.show import progress, say, warn
 from fgtrack.config.reading import read_config
 from fgtrack.config.shipped import suited_reports
@@ -34,9 +33,9 @@ from fgtrack.evaluation.diagnostics import (
     repeated,
     unused,
 )
+from fgtrack.inputs.folders import recordings_by_name
 from fgtrack.meaning.draft import drafted
 from fgtrack.pipeline import replay as pipeline
-from fgtrack.pipeline.recording_jobs import replay_job
 from fgtrack.runs import load_run
 
 
@@ -74,8 +73,11 @@ def replay(
     config = read(config_file)
     given = (config.estimator if estimators is None else estimators).split(",")
     names = tuple(dict.fromkeys(ESTIMATORS.resolve(name.strip()) for name in given))
-    several = listed(recordings, config)
+    several = recordings_by_name(recordings, config.input)
     if len(several) > 1:
+        from fgtrack.cli.recording_folders import Folder
+        from fgtrack.pipeline.recording_jobs import replay_job
+
         every = Folder(several, out, jobs, dask, overwrite)
         config_file = every.config_file(config_file)
         config = read(config_file)

@@ -19,7 +19,6 @@ from fgtrack.cli.arguments import (
     Settings,
     TrackMap,
 )
-from fgtrack.cli.recording_folders import Folder, listed
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
@@ -32,6 +31,7 @@ from fgtrack.evaluation.diagnostics import (
     repeated,
     unused,
 )
+from fgtrack.inputs.folders import recordings_by_name
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
 from fgtrack.pipeline.replay import with_origin
@@ -76,8 +76,10 @@ def study(
     """
     read = partial(read_config, settings=settings, track_map=track_map, pit_map=pit_map)
     config = read(config_file)
-    several = listed(recordings, config)
+    several = recordings_by_name(recordings, config.input)
     if len(several) > 1:
+        from fgtrack.cli.recording_folders import Folder
+
         every = Folder(several, out, jobs, dask, overwrite)
         config_file = every.config_file(config_file)
         config = read(config_file)

@@ -1,8 +1,9 @@
 """Recordings in a folder."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from fgtrack.core.errors import DataError
+from fgtrack.core.errors import CallError, DataError
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.source import file_format, input_kind
 
@@ -31,6 +32,25 @@ def recordings_in(path: Path, config: InputConfig | None = None) -> list[Path]:
         if not found:
             raise
         return found
+
+
+def recordings_by_name(
+    given: Sequence[Path], config: InputConfig | None = None
+) -> dict[str, Path]:
+    """Return the recordings `given`, or those in a single given folder, by name.
+
+    The name is the file's name without its ending, or with it if names are equal
+    otherwise. Raises `CallError` for equal names, and the exceptions of `recordings_in`.
+    """
+    paths = recordings_in(given[0], config) if len(given) == 1 else given
+    stems = [path.name if path.is_dir() else path.name.split(".")[0] for path in paths]
+    names = [
+        stem if stems.count(stem) == 1 else path.name
+        for path, stem in zip(paths, stems, strict=True)
+    ]
+    if len(set(names)) < len(names):
+        raise CallError("two recordings have the same name: give them one by one")
+    return dict(zip(names, paths, strict=True))
 
 
 def _is_recording(path: Path) -> bool:

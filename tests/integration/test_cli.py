@@ -249,8 +249,8 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
             "drive.html: a recording is a stream (.jsonl, .jsonl.gz) or a rosbag2",
         ),
         (
-            ("replay", "drive.jsonl", "b", "-o", "run"),
-            "usage: fgtrack replay [OPTIONS] {INPUT})",
+            ("info", "drive.jsonl", "b"),
+            "usage: fgtrack info [OPTIONS] {INPUT})",
         ),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
         (
