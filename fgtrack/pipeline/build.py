@@ -59,6 +59,7 @@ from fgtrack.tracking.tracker import MultiObjectTracker
 
 #: Stored ego states of the published implementation.
 _EGO_STORAGE_TICKS = 350
+_EGO_MEMORY_S = 5.0
 
 
 def build_tracker(
@@ -297,6 +298,7 @@ def _build_ego(config: Config) -> EgoTrajectory:
         ego.yaw_weight,
         ego.yaw_rate_weight,
         std=known,
+        memory_s=max(_EGO_MEMORY_S, config.effective.reach_s + 2.0),
         position_time_s=time_s,
         growth=growth,
     )

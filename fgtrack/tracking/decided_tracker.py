@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import ClassVar, cast
+from typing import ClassVar, NamedTuple, cast
 
 import numpy as np
 
 from fgtrack.core.types import (
     Disposition,
-    EgoState,
     FinalTrack,
     Revision,
     UpdateRecord,
@@ -17,19 +16,47 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Measurement, Measurements, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
-from fgtrack.tracking.decisions.entries import NOTHING, Entry, Starts
+from fgtrack.tracking.decisions.entries import NOTHING, Entry
 from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
 from fgtrack.tracking.decisions.nodes import NONE, Ended
 from fgtrack.tracking.detections import PosedBatch
-from fgtrack.tracking.inbox import record
-from fgtrack.tracking.lives.counters import Scan
+from fgtrack.tracking.facing import is_read
+from fgtrack.tracking.inbox import Batch, record
+from fgtrack.tracking.list_entries import ListEntries
 from fgtrack.tracking.parts import TrackerParts
-from fgtrack.tracking.preprocess import Candidates, Preprocessed
+from fgtrack.tracking.preprocess import Preprocessed
+from fgtrack.tracking.replaced_lists import Replaced, tracks_of
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 _FIRST_REBUILT = 1_000_000_000
 _GATE_PROBABILITY = 0.9999
+_LAST_SHARE = 0.1  # of the horizon, in which an extrapolated pose becomes final
+
+
+class _Place(NamedTuple):
+    """A candidate of a list, as a measurement of a track."""
+
+    entry: Entry
+    position: int
+    public: int | None
+
+    @property
+    def track(self) -> int:
+        """The track."""
+        return NONE if self.public is None else self.public
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Number of the list, and position."""
+        return self.entry.number, self.position
+
+    @property
+    def detection(self) -> tuple[int, int]:
+        """Key of the detection, which all lists of the same message share."""
+        return id(self.entry.batch.message), self.entry.candidates.leaders[
+            self.position
+        ]
 
 
 class DecidedTracker(MultiObjectTracker):
@@ -50,6 +77,8 @@ class DecidedTracker(MultiObjectTracker):
         "_ended",
         "_of",
         "_fused_as",
+        "_unposed",
+        "_lists",
         "num_revisions",
     )
 
@@ -67,9 +96,13 @@ class DecidedTracker(MultiObjectTracker):
         """Published track of each candidate, by the number of its list; None without a track."""
         self._fused_as: dict[tuple[int, int], tuple[int, Measurement, int]] = {}
         """Track in the bank, stack and row of each fused candidate, by the number of its list and its position."""
+        self._unposed: list[Batch] = []
+        """Lists that could not be placed in the map: no state of the ego was near."""
+        self._lists = ListEntries(parts, decisions)
         self.num_revisions = 0
         """Number of changes of a detection's track by late data."""
         self._revisions: list[Revision] = []
+        self._results: dict[int, UpdateRecord] = {}
         self._final: dict[int, tuple[int, int]] = {}
         """First and last stamps of the detections of each track, by root."""
         self._ended: list[Ended] = []
@@ -97,87 +130,117 @@ class DecidedTracker(MultiObjectTracker):
 
     def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
         """Decide about one list, and fuse its detections."""
-        parts, batch, ego = self._parts, posed.batch, posed.ego
+        parts, batch = self._parts, posed.batch
         message = batch.message
-        if ego is None and message.frame != "map":
+        if posed.ego is None and message.frame != "map":
+            self._unposed.append(batch)
             self._records.append(
                 [record(message, index, Disposition.FAILED) for index in batch.indices]
             )
             return
-        scan = Scan(
-            message.sensor, batch.stamp_ns, parts.bank.present_ns, ego, message.objects
-        )
         candidates, out_of_bounds = (
             preprocessed or parts.preprocess.together([posed])[0]
         )
         self._records.append(out_of_bounds)
         self._forget()
-        if self._is_too_old(batch) or self.decisions.is_too_old(batch.stamp_ns):
+        if self._is_too_old_to_decide(batch):
             every = range(len(candidates))
             self._records += candidates.records(batch, every, Disposition.TOO_OLD)
             return
-        entry = self._entry(posed, candidates, scan)
+        entry = self._lists.made(posed, candidates)
         changes = self.decisions.add(entry)
         self._of[entry.number] = [None] * len(candidates)
-        self._follow(entry, changes)
+        self._follow(entry, changes, Replaced())
 
     def _forget(self) -> None:
         """Decide for good about lists that no late list can precede."""
         oldest_ns = self._parts.bank.window_start_ns
         settled = self.decisions.forget(oldest_ns)
         for each in settled:
+            self._lists.settle(each.entry)
             for position in range(len(self._of.pop(each.entry.number))):
                 self._fused_as.pop((each.entry.number, position), None)
         _settle(settled, self._final, self._ended)
         self._tracks.end(self._lives.ended_before(oldest_ns))
+        self._unposed = [each for each in self._unposed if each.stamp_ns >= oldest_ns]
 
-    def _entry(self, posed: PosedBatch, candidates: Candidates, scan: Scan) -> Entry:
-        """Return a list ready for decisions."""
-        parts, sensor = self._parts, posed.sensor
-        scores = np.zeros(len(candidates))
-        if sensor.score is not None:
-            for position in range(len(candidates)):
-                own = [
-                    each.score
-                    for each in candidates.described(posed.batch, position)
-                    if each.score is not None
-                ]
-                if own:
-                    score = (max(own) - sensor.score.even) / sensor.score.scale
-                    scores[position] = min(max(score, -10.0), 10.0)
-        may_start = np.array(candidates.placed, dtype=bool) & sensor.births
-        starts = Starts(parts.birth, parts.road, self._ego(scan), parts.ego.in_pit)
-        return Entry(
-            posed.batch,
-            candidates,
-            scan,
-            sensor,
-            list(parts.sensors).index(scan.sensor),
-            self.decisions.motion,
-            scores,
-            may_start,
-            starts,
+    def _process_waiting(self) -> bool:
+        """See `MultiObjectTracker._process_waiting`. Lists whose poses have become known better are decided again."""
+        self._forget()
+        bank, ego = self._parts.bank, self._parts.ego
+        after_ns, newest_ns = ego.changed_after_ns(), ego.newest_ns
+        known = range(0)
+        if after_ns is not None and newest_ns is not None:
+            known = range(after_ns + 1, newest_ns + 1)
+        reach_ns = bank.present_ns - bank.window_start_ns
+        open_ns = bank.window_start_ns + round(_LAST_SHARE * reach_ns)
+        self._pose_again(
+            [
+                each
+                for each in self.decisions.entries
+                if each.batch.stamp_ns in known
+                or (each.batch.stamp_ns < open_ns and self._lists.is_open(each))
+            ]
         )
+        return super()._process_waiting()
 
-    def _ego(self, scan: Scan) -> EgoState | None:
-        """Return the ego at the stamp of a list."""
-        pose, current = scan.ego, self._parts.ego.current
-        if pose is None:
-            return None
-        return EgoState(
-            scan.stamp_ns,
-            scan.stamp_ns,
-            *pose[:5],
-            accel_mps2=0.0 if current is None else current.accel_mps2,
-        )
+    def _complete(self) -> None:
+        """See `MultiObjectTracker._complete`. Poses that are still extrapolated become final."""
+        self._pose_again(list(filter(self._lists.is_open, self.decisions.entries)))
 
-    def _follow(self, entry: Entry, changes: Sequence[Explained]) -> None:
-        """Let the estimators follow the decisions, and record the detections of `entry`."""
+    def _pose_again(self, entries: Sequence[Entry]) -> None:
+        """Decide again about the lists whose poses have changed: among `entries`, and those without a pose."""
+        try:
+            old, new = [], []
+            for entry in entries:
+                again = self._lists.again(entry)
+                if again is not None:
+                    old.append(entry)
+                    new.append(again)
+            if self._unposed:
+                new += self._newly_posed()
+            if new:
+                self._replace(old, new)
+        except Exception as error:
+            self._parts.contain(error, Failure.STEP_FAILED)
+
+    def _newly_posed(self) -> list[Entry]:
+        """Return the lists that can be placed in the map now."""
+        waiting, self._unposed = self._unposed, []
+        found: list[Entry] = []
+        for batch in waiting:
+            posed = self._lists.posed(batch)
+            if posed.ego is None:
+                self._unposed.append(batch)
+            elif not self._is_too_old_to_decide(batch):
+                candidates = self._parts.preprocess.together([posed])[0][0]
+                found.append(self._lists.made(posed, candidates))
+        return found
+
+    def _is_too_old_to_decide(self, batch: Batch) -> bool:
+        """True for a list before the lists that are decided for good."""
+        return self._is_too_old(batch) or self.decisions.is_too_old(batch.stamp_ns)
+
+    def _replace(self, old: Sequence[Entry], new: Sequence[Entry]) -> None:
+        """Decide with the lists `new` in place of the lists `old`; new lists without an old one come last."""
+        changes = self.decisions.replace(old, new)
+        replaced = Replaced()
+        for before, after in zip(old, new, strict=False):
+            replaced.add(before, self._of.pop(before.number), after)
+        for entry in new:
+            self._of[entry.number] = replaced.publics_of(entry)
+        self._follow(None, changes, replaced)
+
+    def _follow(
+        self, entry: Entry | None, changes: Sequence[Explained], replaced: Replaced
+    ) -> None:
+        """Let the estimators follow the decisions, and record the detections of the newly received list `entry`."""
         again: set[int] = set()
         named = self._named(changes, again)
-        self._revise(entry, changes, named, again)
-        self._update_lives(entry.batch.stamp_ns)
-        self._record(entry)
+        self._revise(entry, changes, named, again, replaced)
+        self._update_lives()
+        if entry is not None:
+            self._record(entry)
 
     def _named(
         self, changes: Sequence[Explained], again: set[int]
@@ -234,67 +297,194 @@ class DecidedTracker(MultiObjectTracker):
 
     def _revise(
         self,
-        entry: Entry,
+        entry: Entry | None,
         changes: Sequence[Explained],
         named: Sequence[list[int | None]],
         again: set[int],
+        replaced: Replaced,
     ) -> None:
         """Publish the decisions. Estimate tracks once more whose detections have changed, and those in `again`."""
-        lost: dict[int, list[tuple[Entry, int]]] = {}
-        added: list[tuple[Entry, list[int]]] = []
+        lost: list[_Place] = []
+        won: list[_Place] = []
+        corrected = set[tuple[int, int, int]]()
+        for former, own_key in replaced.kept:
+            known = self._fused_as.pop(former, None)
+            if known is not None:
+                self._fused_as[own_key] = known
         for each, own in zip(changes, named, strict=True):
-            before = self._of[each.entry.number]
+            number = each.entry.number
             is_new = each.entry is entry
-            new_positions = []
-            for position, (public, old) in enumerate(zip(own, before, strict=True)):
+            for position, (public, old) in enumerate(
+                zip(own, self._of[number], strict=True)
+            ):
+                is_birth = each.taken[position] == each.entry.roots[position]
+                place = _Place(each.entry, position, public)
+                if is_birth and number in replaced.restarted:
+                    again.add(place.track)
+                if (number, position) in replaced.renewed:
+                    if public is not None:
+                        if public != old or is_birth:
+                            again.add(public)
+                        won.append(place)
+                        corrected.add((*place.detection, public))
+                    continue
                 if public == old:
                     continue
-                if not is_new:
+                if not (is_new or number in replaced.tracks):
                     self._note(each.entry, position, old, public)
                 if old is not None:
-                    lost.setdefault(old, []).append((each.entry, position))
+                    former_place = _Place(each.entry, position, old)
+                    lost.append(former_place)
+                    if not self._leaves_no_trace(former_place):
+                        again.add(old)
                 if public is not None:
-                    is_birth = each.taken[position] == each.entry.roots[position]
                     if self._is_unknown(public) != (is_birth and is_new):
                         again.add(public)
-                    new_positions.append(position)
-            self._of[each.entry.number] = own
-            if new_positions:
-                added.append((each.entry, new_positions))
-        self._results: dict[int, UpdateRecord] = {}
-        for public, places in sorted(lost.items()):
-            is_old = self._began_before_horizon(public)
-            if not is_old and not all(self._leaves_no_trace(*at) for at in places):
+                    won.append(place)
+            self._of[number] = own
+            self._note_replaced(each.entry, own, replaced)
+        for former_list, position, public in replaced.lost:
+            place = _Place(former_list, position, public)
+            lost.append(place)
+            is_corrected = (*place.detection, public) in corrected
+            if not (is_corrected and self._leaves_no_trace(place)):
                 again.add(public)
-            if is_old or public not in again:
-                undone = [self._withdraw(*at) for at in places]
-                if not all(undone):
-                    again.add(public)
-        again = {each for each in again if not self._began_before_horizon(each)}
-        for public in sorted(again):
-            self._rebuild(public, entry)
-        for each_entry, positions in added:
-            rest = [p for p in positions if self._of[each_entry.number][p] not in again]
-            births = [
-                p
-                for p in rest
-                if self._roots[cast(int, self._of[each_entry.number][p])]
-                == each_entry.roots[p]
+        self._results = {}
+        self._estimate(again, lost, won, entry)
+
+    def _estimate(
+        self,
+        again: set[int],
+        lost: Sequence[_Place],
+        won: Sequence[_Place],
+        newest: Entry | None,
+    ) -> None:
+        """Take the `lost` candidates from their tracks, and fuse the candidates that tracks have `won`.
+
+        The tracks in `again` that began inside the horizon start once more with their first detections.
+        """
+        anew = {
+            public
+            for public in again
+            if self._is_unknown(public) or not self._began_before_horizon(public)
+        }
+        stuck = set[tuple[int, int, int]]()
+        for place in lost:
+            if place.track not in anew and not self._withdraw(place):
+                stuck.add((*place.detection, place.track))
+        anew.update(
+            public for _, _, public in stuck if not self._began_before_horizon(public)
+        )
+        chosen = [
+            place
+            for place in won
+            if place.track not in anew and (*place.detection, place.track) not in stuck
+        ]
+        chosen += self._read_again(anew, lost, chosen)
+        for public in anew:
+            bank_id = self._tracks.bank_id(public)
+            if bank_id is not None:
+                self._tracks.drop(bank_id)
+        if anew:
+            chosen += [
+                _Place(each, position, public)
+                for each in self.decisions.entries
+                for position, public in enumerate(self._of[each.number])
+                if public in anew
             ]
-            self._fuse(
-                each_entry, [p for p in rest if p not in births], each_entry is entry
-            )
-            for position in births:
-                self._birth(each_entry, position)
+        begun = set[int]()
+        by_list: dict[int, list[_Place]] = {}
+        for place in chosen:
+            by_list.setdefault(place.entry.number, []).append(place)
+        for places in sorted(by_list.values(), key=lambda each: each[0].entry.key):
+            own = places[0].entry
+            births = [
+                place
+                for place in places
+                if (place.track in anew and place.track not in begun)
+                or self._roots.get(place.track) == own.roots[place.position]
+            ]
+            rest = sorted(place.position for place in places if place not in births)
+            self._fuse(own, rest, own is newest)
+            for place in births:
+                begun.add(place.track)
+                self._birth(own, place.position, is_again=place.track in anew)
+
+    def _read_again(
+        self, anew: set[int], lost: Sequence[_Place], won: Sequence[_Place]
+    ) -> list[_Place]:
+        """Take measurements that were read from the states of their tracks, and return them.
+
+        They are newer than a measurement that the track has lost or won, so they are read from another state now.
+        """
+        since: dict[int, int] = {}
+        for place in (*lost, *won):
+            if place.track not in anew and not self._is_unknown(place.track):
+                stamp_ns = place.entry.batch.stamp_ns
+                since[place.track] = min(since.get(place.track, stamp_ns), stamp_ns)
+        if not since or self.decisions.newest is None:
+            return []
+        first_ns = min(since.values())
+        newer = [
+            each for each in self.decisions.entries if each.batch.stamp_ns >= first_ns
+        ]
+        if not any(map(self._reads_states, newer)):
+            return []
+        taken = {place.key for place in won}
+        found: list[_Place] = []
+        for public, stamp_ns in since.items():
+            own = [
+                _Place(each, position, public)
+                for each in newer
+                if each.batch.stamp_ns >= stamp_ns
+                for position, track in enumerate(self._of[each.number])
+                if track == public
+            ]
+            own = [place for place in own if place.key not in taken]
+            if any(self._reads_states(place.entry) for place in own):
+                found += [
+                    place
+                    for place in reversed(own)
+                    if place.key in self._fused_as and self._withdraw(place)
+                ]
+        return found
+
+    def _reads_states(self, entry: Entry) -> bool:
+        """True for a list whose measurements depend on the states of their tracks."""
+        return any(
+            group.depends_on_state
+            or (self._parts.facing is not None and is_read(group))
+            for group in entry.candidates.groups
+        )
 
     def _note(
         self, entry: Entry, position: int, old: int | None, public: int | None
     ) -> None:
-        """Note that a detection has another track than before."""
+        """Note that a candidate has another track than before."""
+        leader = entry.candidates.leaders[position]
         self.num_revisions += 1
-        message, leader = entry.batch.message, entry.candidates.leaders[position]
-        stamp_ns = message.objects[leader].stamp_ns
-        self._revisions += [
+        for index in (leader, *entry.candidates.merged.get(leader, ())):
+            self._note_detection(entry, index, old, public)
+
+    def _note_replaced(
+        self, entry: Entry, own: Sequence[int | None], replaced: Replaced
+    ) -> None:
+        """Note which detections of a list have other tracks than in the list that it has replaced."""
+        if entry.number not in replaced.tracks:
+            return
+        before, after = replaced.tracks[entry.number], tracks_of(entry, own)
+        for index in sorted({*before, *after}):
+            old, public = before.get(index), after.get(index)
+            if old != public:
+                self.num_revisions += 1
+                self._note_detection(entry, index, old, public)
+
+    def _note_detection(
+        self, entry: Entry, index: int, old: int | None, public: int | None
+    ) -> None:
+        message = entry.batch.message
+        stamp_ns = message.objects[index].stamp_ns
+        self._revisions.append(
             Revision(
                 self._tick,
                 message.sensor,
@@ -304,8 +494,7 @@ class DecidedTracker(MultiObjectTracker):
                 old,
                 public,
             )
-            for index in (leader, *entry.candidates.merged.get(leader, ()))
-        ]
+        )
 
     def _is_unknown(self, public: int) -> bool:
         """True for a track that no estimator holds."""
@@ -316,44 +505,28 @@ class DecidedTracker(MultiObjectTracker):
         bank_id = self._tracks.bank_id(public)
         return bank_id is not None and not self._began_inside(bank_id)
 
-    def _leaves_no_trace(self, entry: Entry, position: int) -> bool:
+    def _leaves_no_trace(self, place: _Place) -> bool:
         """True for a candidate from which a track learns nothing but its state."""
-        known = self._fused_as.get((entry.number, position))
+        known = self._fused_as.get(place.key)
         return (
             known is not None
-            and entry.descriptions[position] is NOTHING
+            and place.entry.descriptions[place.position] is NOTHING
             and "yaw_rad" not in known[1].model.components
         )
 
-    def _withdraw(self, entry: Entry, position: int) -> bool:
-        """Undo the fusion of a candidate with its former track; return False if the bank cannot undo it.
+    def _withdraw(self, place: _Place) -> bool:
+        """Undo the fusion of a candidate with its former track. Return False if the bank cannot undo it.
 
         What the track has learned from a class, an identity or a yaw stays.
         """
-        known = self._fused_as.pop((entry.number, position), None)
+        known = self._fused_as.pop(place.key, None)
         if known is None:
-            return False
+            return True
         bank_id, stack, row = known
         if not self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
             return False
         self._tracks.num_measured[bank_id] -= 1
         return True
-
-    def _rebuild(self, public: int, newest: Entry | None = None) -> None:
-        """Estimate a track once more, from its first detection inside the horizon."""
-        bank_id = self._tracks.bank_id(public)
-        if bank_id is not None:
-            self._tracks.drop(bank_id)
-        is_first = True
-        for entry in self.decisions.entries:
-            for position, each in enumerate(self._of[entry.number]):
-                if each != public:
-                    continue
-                if is_first:
-                    self._birth(entry, position, is_again=True)
-                    is_first = False
-                else:
-                    self._fuse(entry, [position], entry is newest)
 
     def _birth(self, entry: Entry, position: int, is_again: bool = False) -> None:
         """Start the estimator of a track."""
@@ -442,7 +615,7 @@ class DecidedTracker(MultiObjectTracker):
         )
         return assignment._replace(readings=tuple(readings))
 
-    def _update_lives(self, stamp_ns: int) -> None:
+    def _update_lives(self) -> None:
         """Note which tracks live, and end the others."""
         step = self.decisions.newest
         if step is None:
@@ -462,7 +635,7 @@ class DecidedTracker(MultiObjectTracker):
             if public is None:
                 continue
             if self._tracks.bank_id(public) is None:
-                self._rebuild(public)
+                self._estimate({public}, [], [], None)
             held = self._tracks.bank_id(public)
             if held is None:
                 continue

@@ -129,16 +129,19 @@ class Group(NamedTuple):
             R = R + self.stamp_error.noise(own.model, own.pose, x, P[of])
         return R
 
+    @property
+    def depends_on_state(self) -> bool:
+        """True if `noise` depends on the states of the objects."""
+        return self.stamp_error is not None or (
+            self.error is not None and bool(self.stack.model.relative)
+        )
+
     def seen_at(
         self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
     ) -> Measurement:
         """Return the stack of measurements of `members`, ascending. The arguments are those of `noise`."""
-        own, varies = (
-            self.stack,
-            self.stamp_error is not None
-            or (self.error is not None and self.stack.model.relative),
-        )
-        if len(members) == len(own.z) and not varies:
+        own = self.stack
+        if len(members) == len(own.z) and not self.depends_on_state:
             return own
         z, R = own.z.take(members, axis=0), self.noise(members, x, P, of)
         return Measurement(

@@ -232,10 +232,14 @@ class MultiObjectTracker:
         self._fail_rest()
         self._collect(self._parts.bank.present_ns, None)
         self._process_waiting()
+        self._complete()
         updates = (*self.last_updates, *chain.from_iterable(self._records))
         self.last_updates, self._records = updates, []
         self._tracks.end(self._parts.bank.track_ids)
         return tuple(self._publication.smoothed())
+
+    def _complete(self) -> None:
+        """Do what is left after the last list. Nothing is left for a tracker that decides once."""
 
     def revised(self) -> list[Revision]:
         """Return the decisions that late data has changed since the last report or call. This tracker decides once."""

@@ -188,6 +188,19 @@ def test_a_low_pass_takes_its_share_of_the_new_value_once() -> None:
     assert source.current.yaw_rate_radps == pytest.approx(0.4 + 0.4 * 0.6)
 
 
+@given(order=st.permutations(range(6)))
+def test_the_low_pass_follows_the_stamps_in_any_order(order: list[int]) -> None:
+    states = [ego(20.0 * k, x_m=0.2 * k, yaw_rad=0.01 * k * k) for k in range(6)]
+    in_order, source = trajectory(0.6, 0.4), trajectory(0.6, 0.4)
+    for each in states:
+        in_order.receive(each)
+    for k in order:
+        source.receive(states[k])
+    assert source.current == in_order.current
+    for k in range(10):
+        assert pose(source, 10.0 * k) == pose(in_order, 10.0 * k)
+
+
 def test_the_low_pass_wraps() -> None:
     source = trajectory(yaw_weight=0.75)
     source.receive(ego(0.0, yaw_rad=math.pi - 0.1))

@@ -1,7 +1,7 @@
 """Decisions about all lists inside the horizon, in the order of their stamps."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -94,24 +94,43 @@ class Decisions(Stateful):
         """Decide about a list, and again about all newer ones. Return the lists whose decisions are new or changed,
         the oldest one first.
         """
-        count = len(entry.candidates)
-        entry.roots = list(range(self._next_root, self._next_root + count))
-        entry.number, self._next_list = self._next_list, self._next_list + 1
-        self._next_root += count
+        return self.replace([], [entry])
+
+    def replace(self, old: Sequence[Entry], new: Sequence[Entry]) -> list[Explained]:
+        """Decide as if the lists `new` had been there instead of the lists `old`; see `add`.
+
+        A new list that has numbers of tracks keeps them.
+        """
+        if not (old or new):
+            return []
+        for entry in new:
+            entry.number, self._next_list = self._next_list, self._next_list + 1
+            for _ in range(len(entry.candidates) - len(entry.roots)):
+                entry.roots.append(self.next_root())
         if self._first is None:
-            self._first = first_step(
-                self._rules.motion, self._num_sensors, entry.batch.stamp_ns
-            )
-        keys = [each.key for each in self.entries]
-        at = bisect_right(keys, entry.key)
+            first_ns = min(entry.batch.stamp_ns for entry in new)
+            self._first = first_step(self._rules.motion, self._num_sensors, first_ns)
+        entries = self.entries
+        keys = [each.key for each in entries]
+        at = min(
+            [bisect_right(keys, each.key) for each in new]
+            + [entries.index(each) for each in old]
+        )
         step = self._steps[at - 1] if at else self._first
+        gone = {id(each) for each in old}
+        again = [each for each in entries[at:] if id(each) not in gone]
         steps = []
-        for each in [entry, *self.entries[at:]]:
+        for each in sorted([*again, *new], key=lambda entry: entry.key):
             step = following(step, each, self._rules)
             steps.append(step)
         self._steps[at:] = steps
-        self._published.insert(at, NONE)
+        self._published[at:] = [NONE] * len(steps)
         return list(self._changes(at))[::-1]
+
+    def next_root(self) -> int:
+        """Return the next number of a track, which is not given again."""
+        self._next_root += 1
+        return self._next_root - 1
 
     def _changes(self, at: int) -> Iterator[Explained]:
         """Yield the lists whose published hypothesis changes, the newest one first.

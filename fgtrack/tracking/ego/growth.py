@@ -24,6 +24,8 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -60,17 +62,31 @@ _KEPT_NS = nanoseconds(10.0)  # lists before that share no error that a track re
 _LONG_S = 1e3  # T of an error that stays
 
 
+def _zeros(count: int) -> list[list[float]]:
+    return [[0.0] * len(_NONE_FOUND) for _ in range(count)]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learned up to a state of the ego. It is never changed.
+
+    Each row of sums has one entry for the acceleration and one for the yaw acceleration over each duration.
+    """
+
+    lasting: Sequence[Sequence[float]] = field(default_factory=partial(_zeros, 5))
+    """Sums of weights, squares, squares of pairs, products and spacings."""
+    fading: Sequence[Sequence[float]] = field(default_factory=partial(_zeros, 2))
+    """Sums of weights and squares."""
+    recent: Sequence[tuple[int, Sequence[float]]] = ()
+    """Stamps and accelerations of the newest `_SPACING_NS`."""
+    stamp_ns: int | None = None
+    """Stamp of the newest state that was learned from."""
+
+
 class EgoGrowth(Stateful):
     """Learns how an extrapolated pose of the ego grows uncertain, and for how long its error lasts."""
 
-    STATE: ClassVar[tuple[str, ...]] = (
-        "_lasting",
-        "_fading",
-        "_recent",
-        "_learned_ns",
-        "_jumped_ns",
-        "_placed",
-    )
+    STATE: ClassVar[tuple[str, ...]] = ("learned", "_jumps_ns", "_placed")
 
     def __init__(
         self, accel_std_mps2: float, yaw_accel_std_radps2: float, density_m2ps3: float
@@ -81,19 +97,14 @@ class EgoGrowth(Stateful):
         """
         self._density = density_m2ps3
         self._assumed = np.square([accel_std_mps2, yaw_accel_std_radps2])
-        # Sums of weights, squares, squares of pairs, products and spacings, and below of weights and squares. Each
-        # has one entry for the acceleration and one for the yaw acceleration over each duration.
-        self._lasting = [[0.0] * len(_NONE_FOUND) for _ in range(5)]
-        self._fading = [[0.0] * len(_NONE_FOUND) for _ in range(2)]
-        # Stamps and accelerations of the newest `_SPACING_NS`.
-        self._recent = deque[tuple[int, Sequence[float]]]()
-        self._learned_ns: int | None = None
-        self._jumped_ns = 0
+        self.learned = Learned()
+        """What was learned up to the newest state."""
+        self._jumps_ns: list[int] = [0]
         self._placed = deque[int]()  # stamps of lists with extrapolated poses
 
     def jumped(self, stamp_ns: int) -> None:
         """Learn nothing from states before `stamp_ns`, where the ego has jumped to another position."""
-        self._jumped_ns = stamp_ns
+        bisect.insort(self._jumps_ns, stamp_ns)
 
     def learn(
         self,
@@ -106,17 +117,18 @@ class EgoGrowth(Stateful):
         `positions_at` returns x, y and yaw of a state that is extrapolated to a stamp.
         """
         newest, stamp_ns = states[-1], stamps_ns[-1]
-        step_s = _STEP_S
-        if self._learned_ns is not None:
-            step_s = (stamp_ns - self._learned_ns) / NS_PER_S
+        learned_ns, step_s = self.learned.stamp_ns, _STEP_S
+        if learned_ns is not None:
+            step_s = (stamp_ns - learned_ns) / NS_PER_S
         if step_s < _STEP_S:
             return
-        self._learned_ns = stamp_ns
+        jump = bisect.bisect_right(self._jumps_ns, stamp_ns)
+        jumped_ns = self._jumps_ns[max(jump - 1, 0)]
         found = list(_NONE_FOUND)
         c, s = math.cos(newest.yaw_rad), math.sin(newest.yaw_rad)
         for k, (duration_ns, longest_ns) in enumerate(_DURATIONS_NS):
             row = bisect.bisect_right(stamps_ns, stamp_ns - duration_ns) - 1
-            if row < 0 or stamps_ns[row] < self._jumped_ns:
+            if row < 0 or stamps_ns[row] < jumped_ns:
                 continue
             elapsed_ns = stamp_ns - stamps_ns[row]
             if elapsed_ns > longest_ns:
@@ -140,12 +152,13 @@ class EgoGrowth(Stateful):
         NaN marks a duration without states. Numbers are added one by one: there are eight of them, and each operation
         on arrays takes longer than all of these.
         """
-        self._fade(weight_s)
-        weights_s, squares, pairs, products, spacings_s = self._lasting
-        soon_weights_s, soon_squares = self._fading
-        recent = self._recent
+        lasting = _faded(self.learned.lasting, weight_s, _FORGET_S)
+        fading = _faded(self.learned.fading, weight_s, _FORGET_SOON_S)
+        weights_s, squares, pairs, products, spacings_s = lasting
+        soon_weights_s, soon_squares = fading
+        recent = list(self.learned.recent)
         while len(recent) > 1 and stamp_ns - recent[1][0] >= _SPACING_NS:
-            recent.popleft()
+            recent.pop(0)
         before: Sequence[float] = _NONE_FOUND
         spacing_s = 0.0
         if recent and stamp_ns - recent[0][0] >= _SPACING_NS:
@@ -165,26 +178,19 @@ class EgoGrowth(Stateful):
                 products[row] += weight_s * new * old
                 spacings_s[row] += pair * spacing_s
         recent.append((stamp_ns, found))
+        self.learned = Learned(lasting, fading, recent, stamp_ns)
 
-    def _fade(self, weight_s: float) -> None:
-        """Reduce the sums by the time `weight_s` that has passed."""
-        for sums, memory_s in (
-            (self._lasting, _FORGET_S),
-            (self._fading, _FORGET_SOON_S),
-        ):
-            keep = math.exp(-weight_s / memory_s)
-            for row in sums:
-                for k, each in enumerate(row):
-                    row[k] = keep * each
-
-    def _of(self, duration_s: float) -> tuple[FloatArray, FloatArray]:
+    def _of(
+        self, duration_s: float, learned: Learned | None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return mean square and correlation time of acceleration and yaw acceleration over a duration, shape (2,)."""
-        lasting = np.array(self._lasting).reshape(5, -1, 2)
+        known_by = self.learned if learned is None else learned
+        lasting = np.array(known_by.lasting).reshape(5, -1, 2)
         seen = lasting[0, :, 0] > 0.0
         if not seen.any():
             return self._assumed, np.full(2, _LONG_S)
         weights_s, sums, pairs, products, spacings_s = lasting[:, seen]
-        soon_weights_s, soon_sums = np.array(self._fading).reshape(2, -1, 2)[:, seen]
+        soon_weights_s, soon_sums = np.array(known_by.fading).reshape(2, -1, 2)[:, seen]
         prior_s = _PRIOR_S * np.exp(-weights_s / _PRIOR_LASTS_S)
         ever = (prior_s * self._assumed + sums) / (prior_s + weights_s)
         soon = (prior_s * self._assumed + soon_sums) / (prior_s + soon_weights_s)
@@ -200,13 +206,15 @@ class EgoGrowth(Stateful):
         mean = np.array([np.interp(at, known, squares[:, k]) for k in range(2)])
         return mean, np.array([np.interp(at, known, times_s[:, k]) for k in range(2)])
 
-    def covariance(self, ego: EgoState, duration_s: float) -> FloatArray:
+    def covariance(
+        self, ego: EgoState, duration_s: float, learned: Learned | None = None
+    ) -> FloatArray:
         """Growth of the covariance of x, y, yaw, speed and yaw rate of `ego` over `duration_s`, shape (5, 5).
 
-        The growth comes from unknown accelerations. The covariance of `ego` itself is not
-        included.
+        The growth comes from unknown accelerations, as far as they were `learned`; None is all that was learned. The
+        covariance of `ego` itself is not included.
         """
-        by_accel, by_yaw_accel = self._parts(ego, duration_s)
+        by_accel, by_yaw_accel = self._parts(ego, duration_s, learned)
         return by_accel + by_yaw_accel
 
     def shared(
@@ -215,14 +223,19 @@ class EgoGrowth(Stateful):
         duration_s: float,
         stamp_ns: int,
         range_m: float | None = None,
+        learned: Learned | None = None,
+        others_ns: Sequence[int] | None = None,
     ) -> FloatArray:
-        """Return the `covariance` that counts for a list at `stamp_ns`. Note that the list shares the error.
+        """Return the `covariance` that counts for a list at `stamp_ns`.
 
-        `range_m` is the usual distance of the objects of the list; None if it is unknown.
+        `range_m` is the usual distance of the objects of the list; None if it is unknown. `others_ns` are the stamps
+        of the lists that share the error. With None they are those of the calls before, and this list is noted.
         """
         range_m = _RANGE_M if range_m is None else range_m
-        parts, (_, times_s) = self._parts(ego, duration_s), self._of(abs(duration_s))
-        apart_s = np.array([abs(seconds(stamp_ns - each)) for each in self._placed])
+        parts = self._parts(ego, duration_s, learned)
+        _, times_s = self._of(abs(duration_s), learned)
+        shared_ns = self._placed if others_ns is None else others_ns
+        apart_s = np.array([abs(seconds(stamp_ns - each)) for each in shared_ns])
         total = np.zeros((5, 5))
         for part, time_s in zip(parts, times_s.tolist(), strict=True):
             variance_m2 = 0.5 * float(part[0, 0] + part[1, 1]) + range_m**2 * float(
@@ -231,14 +244,18 @@ class EgoGrowth(Stateful):
             memory_s = (_SHARE**4 * 2.0 * variance_m2 / self._density) ** (1.0 / 3.0)
             rate_hz = 1.0 / max(memory_s, _LEAST_S) + 1.0 / max(time_s, _LEAST_S)
             total += (1.0 + 2.0 * float(np.exp(-apart_s * rate_hz).sum())) * part
+        if others_ns is not None:
+            return total
         self._placed.append(stamp_ns)
         while stamp_ns - self._placed[0] > _KEPT_NS:
             self._placed.popleft()
         return total
 
-    def _parts(self, ego: EgoState, duration_s: float) -> tuple[FloatArray, FloatArray]:
+    def _parts(
+        self, ego: EgoState, duration_s: float, learned: Learned | None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the parts of `covariance` that come from the acceleration and from the yaw acceleration."""
-        squares, _ = self._of(abs(duration_s))
+        squares, _ = self._of(abs(duration_s), learned)
         along, turn = (0.75 * squares * abs(duration_s)).tolist()
         back = math.copysign(1.0, duration_s)
         signs = np.array(
@@ -257,3 +274,11 @@ class EgoGrowth(Stateful):
             for motion in motions
         )
         return by_accel, by_yaw_accel
+
+
+def _faded(
+    sums: Sequence[Sequence[float]], weight_s: float, memory_s: float
+) -> list[list[float]]:
+    """Return sums as they are after the time `weight_s`."""
+    keep = math.exp(-weight_s / memory_s)
+    return [[keep * each for each in row] for row in sums]

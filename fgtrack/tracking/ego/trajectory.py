@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
+from itertools import pairwise
 from operator import attrgetter
 from typing import ClassVar, NamedTuple
 
@@ -22,7 +23,7 @@ from fgtrack.models.dead_reckoning import (
     ReportedErrors,
     estimate_position,
 )
-from fgtrack.tracking.ego.growth import EgoGrowth
+from fgtrack.tracking.ego.growth import EgoGrowth, Learned
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
 MAX_EXTRAPOLATION_S = 1.0
@@ -174,6 +175,8 @@ class EgoTrajectory(Stateful):
     both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States that never
     fit, of an ego with an unknown speed, are all taken.
 
+    If a state comes late, the newer states are filtered once more: the low-pass and the growth follow the stamps.
+
     With `position_time_s`, the correlation time of the error of reported positions, these are fused with speed and yaw,
     see `dead_reckoning`. An error that all poses of a track have in common is no motion of it, so the position of a
     pose has the variance of a dead reckoning of 1 s, as long as a track remembers, instead of its own.
@@ -188,6 +191,10 @@ class EgoTrajectory(Stateful):
         "_fits",
         "_states",
         "_stamps",
+        "_reported",
+        "_learned",
+        "_in_pit",
+        "_changed_ns",
         "current",
         "jumps",
         "in_pit",
@@ -211,9 +218,7 @@ class EgoTrajectory(Stateful):
             std,
         )
         self._position_time_s = position_time_s
-        self._reckoned: list[
-            tuple[EgoState, PositionEstimate]
-        ] = []  # states as reported, where they are fused
+        self._reckoned: list[PositionEstimate] = []  # of states that are fused
         self._memory_ns = nanoseconds(memory_s)
         self._newest_ns: int | None = None
         self._last: EgoState | None = None
@@ -221,6 +226,12 @@ class EgoTrajectory(Stateful):
         self._fits = False  # the last two states are consistent
         self._states: list[EgoState] = []
         self._stamps: list[int] = []
+        # States as they were reported, and what the growth had learned at each.
+        self._reported: list[EgoState] = []
+        self._learned: list[Learned | None] = []
+        # Stamps and values of the states that tell whether the ego is in the pit lane.
+        self._in_pit: list[tuple[int, bool]] = []
+        self._changed_ns: int | None = None
         self.current: EgoState | None = None
         """Newest state."""
         self.jumps = 0
@@ -234,7 +245,8 @@ class EgoTrajectory(Stateful):
         None if no state is refused.
         """
         if ego.in_pit is not None:
-            self.in_pit = ego.in_pit
+            bisect.insort(self._in_pit, (ego.stamp_ns, ego.in_pit))
+            self.in_pit = self._in_pit[-1][1]
         if not is_finite(ego):
             return "not finite"
         if (
@@ -266,23 +278,46 @@ class EgoTrajectory(Stateful):
         """Stamp of the newest state from which poses are taken; None before the first state."""
         return self._stamps[-1] if self._stamps else None
 
+    def changed_after_ns(self) -> int | None:
+        """Return the stamp after which poses may have changed since the last call; None if no pose has changed."""
+        changed_ns, self._changed_ns = self._changed_ns, None
+        return changed_ns
+
+    def accel_at(self, stamp_ns: int) -> float:
+        """Return the acceleration that the nearest state reports, in m/s^2; 0 without a state."""
+        return self._nearest(stamp_ns).accel_mps2 if self._stamps else 0.0
+
+    def in_pit_at(self, stamp_ns: int) -> bool:
+        """True if the ego was in the pit lane, by the states up to a stamp."""
+        row = bisect.bisect_right(self._in_pit, (stamp_ns, True))
+        return self._in_pit[row - 1][1] if row else False
+
     def placed(
-        self, stamp_ns: int, present_ns: int, range_m: Callable[[], float | None]
+        self,
+        stamp_ns: int,
+        present_ns: int,
+        range_m: Callable[[], float | None],
+        others_ns: Sequence[int] | None = None,
     ) -> EgoPose | None:
         """Return `pose_at` for a list whose detections are moved into the map by this pose.
 
         `range_m` returns the usual distance of the objects of the list. The error of an extrapolated pose lasts for
-        several lists: its growth counts as `EgoGrowth` describes.
+        several lists: its growth counts as `EgoGrowth` describes. `others_ns` are the stamps of the lists that share
+        this error; None for all lists that were placed before.
         """
         pose = self.pose_at(stamp_ns, present_ns)
         if pose is None or self._growth is None or not pose.extrapolated_s:
             return pose
         ego = self._nearest(stamp_ns)
-        return self._grown(
+        shared = self._growth.shared(
             ego,
+            pose.extrapolated_s,
             stamp_ns,
-            self._growth.shared(ego, pose.extrapolated_s, stamp_ns, range_m()),
+            range_m(),
+            self._learned_at(stamp_ns),
+            others_ns,
         )
+        return self._grown(ego, stamp_ns, shared)
 
     def growth_at(self, stamp_ns: int) -> FloatArray | None:
         """Covariance that an extrapolation from the nearest state to `stamp_ns` adds, shape (5, 5).
@@ -292,7 +327,11 @@ class EgoTrajectory(Stateful):
         if self._growth is None or not self._stamps:
             return None
         nearest = self._nearest(stamp_ns)
-        return self._growth.covariance(nearest, seconds(stamp_ns - nearest.stamp_ns))
+        return self._growth.covariance(
+            nearest,
+            seconds(stamp_ns - nearest.stamp_ns),
+            self._learned_at(stamp_ns),
+        )
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
         """Return the pose at `stamp_ns`, or None if it is unknown. `present_ns` is the tracking time.
@@ -321,10 +360,17 @@ class EgoTrajectory(Stateful):
     def _nearest(self, stamp_ns: int) -> EgoState:
         return min(self._around(stamp_ns), key=lambda ego: abs(stamp_ns - ego.stamp_ns))
 
+    def _learned_at(self, stamp_ns: int) -> Learned | None:
+        """Return what the growth had learned at the first state at or after a stamp; at the newest one without it."""
+        row = bisect.bisect_left(self._stamps, stamp_ns)
+        return self._learned[min(row, len(self._learned) - 1)]
+
     def _store(self, ego: EgoState) -> str | None:
         """Insert a state, or hold it back. Return the reason if it, or the state held back before, is refused; else
         None.
         """
+        if self._fits_its_neighbours(ego):
+            return self._insert(ego)
         last, held, self._held = self._last, self._held, None
         if last is None or _consistent(last, ego):
             self._fits, self._last = last is not None, ego
@@ -342,71 +388,90 @@ class EgoTrajectory(Stateful):
         reason = self._insert(held)
         return self._insert(ego) or reason
 
-    def _insert(self, ego: EgoState) -> str | None:
-        """Insert a state by its stamp. Return the reason if it is refused, else None.
+    def _fits_its_neighbours(self, ego: EgoState) -> bool:
+        """True for a late state between two states that it does not contradict."""
+        row = bisect.bisect_left(self._stamps, ego.stamp_ns)
+        return 0 < row < len(self._stamps) and all(
+            _consistent(*pair)
+            for pair in pairwise((self._states[row - 1], ego, self._states[row]))
+        )
 
-        Only the newest state is low-passed.
-        """
+    def _insert(self, ego: EgoState) -> str | None:
+        """Insert a state by its stamp, and filter all newer ones again. Return the reason if it is refused, or None."""
         stamps_ns = self._stamps
         row = bisect.bisect_left(stamps_ns, ego.stamp_ns)
-        if row == len(stamps_ns):
-            if self.current is not None:
-                turned_rad = self.current.yaw_rate_radps * (
-                    (ego.stamp_ns - self.current.stamp_ns) / NS_PER_S
-                )
-                ego = self._low_passed(
-                    ego, self.current.yaw_rad + turned_rad, self.current.yaw_rate_radps
-                )
-            self.current = ego
-        elif stamps_ns[row] == ego.stamp_ns:
-            return "repeated stamp"
-        stamps_ns.insert(row, ego.stamp_ns)
-        self._states.insert(row, ego)
-        if self._position_time_s is not None:
-            self._reckon(row, self._position_time_s)
-        if self._growth is not None and row == len(stamps_ns) - 1:
-            self._growth.learn(self._states, stamps_ns, self._moved)
-        oldest_ns = stamps_ns[-1] - self._memory_ns
-        if (
-            len(stamps_ns) > 64 and stamps_ns[64] < oldest_ns
-        ):  # in portions: cutting a list copies it
-            gone = bisect.bisect_left(stamps_ns, oldest_ns) - 1
-            del stamps_ns[:gone], self._states[:gone], self._reckoned[:gone]
+        newer = self._reported[row:]
+        if newer:
+            if newer[0].stamp_ns == ego.stamp_ns:
+                return "repeated stamp"
+            del self._reported[row:], self._states[row:], stamps_ns[row:]
+            del self._learned[row:], self._reckoned[row:]
+            self.current = self._states[-1] if row else None
+            if self._growth is not None:
+                self._growth.learned = (self._learned[-1] if row else None) or Learned()
+        before_ns = stamps_ns[-1] if row else -(2**63)
+        if self._changed_ns is None or before_ns < self._changed_ns:
+            self._changed_ns = before_ns
+        for each in (ego, *newer):
+            self._append(each)
+        self._forget()
         return None
 
-    def _reckon(self, row: int, time_s: float) -> None:
-        """Move the states from the new state at `row` on to the positions of dead reckoning."""
-        reported = [self._states[row], *(ego for ego, _ in self._reckoned[row:])]
-        del self._reckoned[row:]
-        for k, ego in enumerate(reported, row):
-            P = _completed(ego.covariance, self._std or EgoStd())
-            P = np.zeros((5, 5)) if P is None else P.copy()
-            variance_m2 = max(0.5 * float(P[0, 0] + P[1, 1]), _LEAST_STD**2)
-            speed_variance = max(
-                float(P[3, 3] + ego.speed_mps**2 * P[2, 2]), _LEAST_STD**2
+    def _append(self, ego: EgoState) -> None:
+        """Append the newest state, low-passed."""
+        self._reported.append(ego)
+        if self.current is not None:
+            turned_rad = self.current.yaw_rate_radps * (
+                (ego.stamp_ns - self.current.stamp_ns) / NS_PER_S
             )
-            velocity_mps = (
-                ego.speed_mps * math.cos(ego.yaw_rad),
-                ego.speed_mps * math.sin(ego.yaw_rad),
+            ego = self._low_passed(
+                ego, self.current.yaw_rad + turned_rad, self.current.yaw_rate_radps
             )
-            errors = ReportedErrors(variance_m2, time_s, speed_variance * _REMEMBERED_S)
-            last = self._reckoned[-1][1] if k else None
-            own = estimate_position(
-                last, ego.stamp_ns, (ego.x_m, ego.y_m), velocity_mps, errors
-            )
-            self._reckoned.append((ego, own))
-            P[:2] = P[:, :2] = 0.0
-            P[0, 0] = P[1, 1] = errors.density_m2ps * _REMEMBERED_S
-            x_m, y_m = own.position_m
-            self._states[k] = replace(
-                ego, x_m=x_m, y_m=y_m, covariance=tuple(P.ravel().tolist())
-            )
-        self.current = self._states[-1]
+        if self._position_time_s is not None:
+            ego = self._reckon(ego, self._position_time_s)
+        self.current = ego
+        self._stamps.append(ego.stamp_ns)
+        self._states.append(ego)
+        if self._growth is not None:
+            self._growth.learn(self._states, self._stamps, self._moved)
+        self._learned.append(None if self._growth is None else self._growth.learned)
+
+    def _forget(self) -> None:
+        """Forget the oldest states, in portions: cutting a list copies it."""
+        stamps_ns = self._stamps
+        oldest_ns = stamps_ns[-1] - self._memory_ns
+        if len(stamps_ns) > 64 and stamps_ns[64] < oldest_ns:
+            gone = bisect.bisect_left(stamps_ns, oldest_ns) - 1
+            del stamps_ns[:gone], self._states[:gone], self._reported[:gone]
+            del self._learned[:gone], self._reckoned[:gone]
+            first = bisect.bisect_right(self._in_pit, (stamps_ns[0], True))
+            del self._in_pit[: max(first - 1, 0)]
+
+    def _reckon(self, ego: EgoState, time_s: float) -> EgoState:
+        """Return the newest state at its position by dead reckoning."""
+        P = _completed(ego.covariance, self._std or EgoStd())
+        P = np.zeros((5, 5)) if P is None else P.copy()
+        variance_m2 = max(0.5 * float(P[0, 0] + P[1, 1]), _LEAST_STD**2)
+        speed_variance = max(float(P[3, 3] + ego.speed_mps**2 * P[2, 2]), _LEAST_STD**2)
+        velocity_mps = (
+            ego.speed_mps * math.cos(ego.yaw_rad),
+            ego.speed_mps * math.sin(ego.yaw_rad),
+        )
+        errors = ReportedErrors(variance_m2, time_s, speed_variance * _REMEMBERED_S)
+        last = self._reckoned[-1] if self._reckoned else None
+        own = estimate_position(
+            last, ego.stamp_ns, (ego.x_m, ego.y_m), velocity_mps, errors
+        )
+        self._reckoned.append(own)
+        P[:2] = P[:, :2] = 0.0
+        P[0, 0] = P[1, 1] = errors.density_m2ps * _REMEMBERED_S
+        x_m, y_m = own.position_m
+        return replace(ego, x_m=x_m, y_m=y_m, covariance=tuple(P.ravel().tolist()))
 
     def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
         elapsed_s = seconds(stamp_ns - ego.stamp_ns)
         growth = (
-            self._growth.covariance(ego, elapsed_s)
+            self._growth.covariance(ego, elapsed_s, self._learned_at(stamp_ns))
             if self._growth is not None and elapsed_s
             else None
         )
@@ -503,7 +568,10 @@ class EgoTrajectory(Stateful):
             np.array(extrapolated(ego, stamp_ns)[:5]) for ego in (before, after)
         )
         P, R = (
-            growth.covariance(ego, seconds(stamp_ns - ego.stamp_ns)) + _ROUNDING
+            growth.covariance(
+                ego, seconds(stamp_ns - ego.stamp_ns), self._learned_at(stamp_ns)
+            )
+            + _ROUNDING
             for ego in (before, after)
         )
         difference = second - first
