@@ -222,7 +222,7 @@ class DecidedTracker(MultiObjectTracker):
         return self._is_too_old(batch) or self.decisions.is_too_old(batch.stamp_ns)
 
     def _replace(self, old: Sequence[Entry], new: Sequence[Entry]) -> None:
-        """Decide with the lists `new` in place of the lists `old`; new lists without an old one come last."""
+        """Decide with the lists `new` instead of the lists `old`; new lists that replace none come last."""
         changes = self.decisions.replace(old, new)
         replaced = Replaced()
         for before, after in zip(old, new, strict=False):

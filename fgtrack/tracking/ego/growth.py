@@ -68,7 +68,7 @@ def _zeros(count: int) -> list[list[float]]:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned up to a state of the ego. It is never changed.
+    """Sums that were learned up to a state of the ego. They are never changed.
 
     Each row of sums has one entry for the acceleration and one for the yaw acceleration over each duration.
     """

@@ -229,7 +229,7 @@ class EgoTrajectory(Stateful):
         # States as they were reported, and what the growth had learned at each.
         self._reported: list[EgoState] = []
         self._learned: list[Learned | None] = []
-        # Stamps and values of the states that tell whether the ego is in the pit lane.
+        # Stamps and values of the states that report whether the ego is in the pit lane.
         self._in_pit: list[tuple[int, bool]] = []
         self._changed_ns: int | None = None
         self.current: EgoState | None = None
