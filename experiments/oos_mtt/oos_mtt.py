@@ -8,7 +8,7 @@ The model of the scenes is given to every tracker, and nothing is tuned.
 
 import csv
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -41,6 +41,7 @@ METHODS: Mapping[str, tuple[str, bool]] = {
     "smoother": ("smoother", False),
     "smoother-banded-in-order": ("smoother-banded", True),
 }
+LABELS = (*METHODS, REFERENCE)
 PARTS = ("localisation_m2", "missed_m2", "false_m2", "switches_m2")
 
 
@@ -163,10 +164,12 @@ def write_trajectories(path: Path, found: list[Trajectory]) -> None:
 
 
 def judged(
-    name: str, scene: Scene, out: Path
+    name: str, scene: Scene, out: Path, labels: Sequence[str] = LABELS
 ) -> Iterator[tuple[str, Mapping[str, float]]]:
     """Yield label, score and CPU time of each method on a scene; writes the trajectories."""
     for label, (estimator, in_order) in METHODS.items():
+        if label not in labels:
+            continue
         started_s = time.process_time()
         replayed = scene.in_order() if in_order else scene
         run = fgtrack.replay(list(replayed.messages()), configuration(estimator))
@@ -174,6 +177,8 @@ def judged(
         cpu_s = time.process_time() - started_s
         write_trajectories(out / name / label / "trajectories.csv", found)
         yield label, {**squared_per_scan(scene, found), "cpu_s": cpu_s}
+    if REFERENCE not in labels:
+        return
     started_s = time.process_time()
     found = trajectories(scene, NUM_HYPOTHESES)
     cpu_s = time.process_time() - started_s
@@ -188,14 +193,17 @@ def main(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder.")] = Path("out"),
     draw: Annotated[int, typer.Option(help="Number of scenes that are drawn.")] = 0,
     seed: Annotated[int, typer.Option(help="Seed of the first drawn scene.")] = 1,
+    methods: Annotated[
+        str, typer.Option(help=f"Of {', '.join(LABELS)}, with commas.")
+    ] = ",".join(LABELS),
 ) -> None:
-    """Print T-GOSPA squared per scan of every method, and write the trajectories."""
+    """Print T-GOSPA squared per scan of the methods, and write the trajectories."""
     every = {path.name.partition(".")[0]: read_scene(path) for path in scenes or ()}
     for number in range(seed, seed + draw):
         every[f"drawn{number}"] = draw_scene(np.random.default_rng(number))
     scores: dict[str, list[Mapping[str, float]]] = {}
     for name, scene in every.items():
-        for label, score in judged(name, scene, out):
+        for label, score in judged(name, scene, out, methods.split(",")):
             scores.setdefault(label, []).append(score)
             typer.echo(f"{name} {label}: {_row(score)}")
     for label, of_scenes in scores.items():
@@ -204,6 +212,12 @@ def main(
             for key in of_scenes[0]
         }
         typer.echo(f"mean {label}: {_row(mean)}")
+        totals = [score["total_m2"] for score in of_scenes]
+        shares = np.quantile(totals, [0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0]).tolist()
+        texts = ", ".join(f"{value:.1f}" for value in shares)
+        typer.echo(
+            f"{label}: quantiles 0, 5, 25, 50, 75, 95, 100 % of {len(totals)} totals: {texts} m^2"
+        )
 
 
 def _row(score: Mapping[str, float]) -> str:
