@@ -243,6 +243,16 @@ def test_labels_at_the_ends_of_lines_do_not_overlap(tmp_path: Path) -> None:
     assert all(box.x1 <= figure.bbox.width + 1.0 for box in boxes)
 
 
+def test_labels_at_the_ends_of_a_narrow_figure_leave_the_curves_half_of_the_width() -> (
+    None
+):
+    figure = plot.error_against_delay(width="3.4in", legend="ends")
+    figure.draw_without_rendering()
+    [axes] = figure.axes
+    assert "smoother,\n0.3 s later" in [text.get_text() for text in axes.texts]
+    assert axes.get_window_extent().width > 0.5 * figure.bbox.width
+
+
 def test_a_legend_above_a_narrow_figure_has_columns(tmp_path: Path) -> None:
     figure = plot.sweep(a_sweep(tmp_path / "sweep", estimators=4), width="3.4in")
     legend = figure.axes[0].get_legend()

@@ -159,11 +159,11 @@ def _columns(widths: Sequence[int], width: int) -> int:
     return 1
 
 
-def legend_at_ends(axes: Axes) -> None:
+def legend_at_ends(axes: Axes, breaks: bool = False) -> None:
     """Write the label of each line beside its right end, in the colour of the line.
 
-    Labels are moved apart so that they do not overlap. A plot whose lines have no values
-    gets no labels.
+    Labels are moved apart so that they do not overlap. With `breaks`, a label has a line
+    break after its comma. A plot whose lines have no values gets no labels.
     """
     handles, labels = axes.get_legend_handles_labels()
     figure = axes.get_figure(root=True)
@@ -175,11 +175,14 @@ def legend_at_ends(axes: Axes) -> None:
     ]
     if not ends or figure is None:
         return
+    if breaks:
+        ends = [(line, text.replace(", ", ",\n"), x, y) for line, text, x, y in ends]
     figure.draw_without_rendering()
     points = axes.transData.transform([(x, y) for _, _, x, y in ends])
     heights = axes.transAxes.inverted().transform(points)[:, 1]
     box = axes.get_window_extent()
-    step = _LINE * size_in("legend.fontsize") * figure.dpi / box.height
+    lines_a_label = 1 + max(text.count("\n") for _, text, _, _ in ends)
+    step = lines_a_label * _LINE * size_in("legend.fontsize") * figure.dpi / box.height
     for k, height in zip(
         np.argsort(heights), _apart(np.sort(heights), step), strict=True
     ):
@@ -191,6 +194,7 @@ def legend_at_ends(axes: Axes) -> None:
             xytext=(4.0, 0.0),
             textcoords="offset points",
             va="center",
+            linespacing=1.0,
             fontsize=72.0 * size_in("legend.fontsize"),
             color=line.get_color(),
             annotation_clip=False,

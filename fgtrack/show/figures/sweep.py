@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables.metric_names import METRIC_NAMES, metric_words, words
 from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
-from fgtrack.show.figures.paper import Paper, Sheet, styled
+from fgtrack.show.figures.paper import Paper, Sheet, is_column, styled
 from fgtrack.show.figures.style import legend_above, legend_at_ends, log_axis, size_in
 from fgtrack.show.palette import style_of, styles
 
@@ -199,7 +199,7 @@ def _set_scales(
 def _write_legend(axes: Axes, paper: Paper) -> None:
     """Write the legend above the plot, or at the ends of the lines."""
     if paper.get("legend") == "ends":
-        legend_at_ends(axes)
+        legend_at_ends(axes, breaks=is_column(paper))
     else:
         legend_above(axes)
 
@@ -262,7 +262,7 @@ def error_against_delay(
             later = metric_words(metric).partition(", ")[2]
             later = later.removeprefix("output ")
             line, marker, label = (
-                (":", ".", f"{name}, {later}")
+                ("-." if its.line == ":" else ":", ".", f"{name}, {later}")
                 if later
                 else (its.line, its.marker, name)
             )
