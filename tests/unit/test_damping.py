@@ -12,7 +12,8 @@ from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import SensorPose, measurement_model
-from fgtrack.models.motion import CV
+from fgtrack.models.motion import CTRV, CV, Transition
+from fgtrack.models.sensors import RobustLoss
 
 STD_RAD, RANGE_STD_M, STEP_S = np.deg2rad(0.1), 60.0, 0.2
 MOTION = CV(velocity_density_m2ps3=0.05)
@@ -89,3 +90,38 @@ def test_positions_need_none() -> None:
         for k in range(5)
     ]
     assert not tracked([fixes], SmootherBank).failures.counts
+
+
+class OwnTransition(CTRV):
+    """CTRV as a model that is not compiled."""
+
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        return super().transition(x, dt_s)
+
+
+def test_the_compiled_cost_of_a_window_is_that_of_its_models() -> None:
+    """With a robust loss, a prior of left states, and stamps 1 us apart, whose process noise is almost singular."""
+    rng, banks = np.random.default_rng(5), [SmootherBank(CTRV(), 0.8)]
+    banks.append(SmootherBank(OwnTransition(), 0.8))
+    loss = RobustLoss("huber", 1.0)
+    times_s = (0.1, 0.3, 0.5, 0.500002, 0.7, 1.2, 0.9)
+    for bank in banks:
+        bank.birth(0, Start(position_m=(20.0, 5.0), yaw_rad=0.3, speed_mps=9.0))
+    for time_s in times_s:
+        measurement = Measurement.of(
+            round(time_s * NS_PER_S),
+            range_m=20.0 + 9.0 * time_s + rng.normal(),
+            bearing_rad=0.25 + 0.1 * rng.normal(),
+            std={"range_m": 0.5, "bearing_rad": 0.02},
+            loss=loss,
+        )
+        for bank in banks:
+            bank.update(measurement.stamp_ns, [0], [measurement])
+    compiled, numpy = (bank.solver for bank in banks)
+    estimates = compiled.estimates(0)
+    assert len(estimates) == 6
+    for _ in range(10):
+        means = estimates + 0.1 * rng.normal(size=estimates.shape)
+        expected = numpy._cost(0, means)
+        assert expected > 10.0
+        assert compiled._cost(0, means) == pytest.approx(expected, rel=1e-6)

@@ -18,7 +18,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     CHANGED,
     CODE,
     COUNT,
-    FIRST,
     INDICES,
     LOSS,
     NODES,
@@ -42,7 +41,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     Z,
     check_nodes,
     check_seen,
-    check_track,
 )
 from fgtrack.models.measurement_kernels import (
     NUM_COMPONENTS,
@@ -171,41 +169,6 @@ def _linearise_rows(
                 rows[at, row + a, j] = share * out[a, j]
         row += k
     labels[at, CHANGED] = 1
-
-
-@njit(f"float64(int64, {TIMES}, int64, {VECTORS}, {NODES}, {SEEN})")
-def measurement_cost(
-    kind: int,
-    noise: FloatArray,
-    track: int,
-    means: FloatArray,
-    nodes: Arrays,
-    seen: Seen,
-) -> float:
-    """Return the sum of the losses of all measurements of a window, at the states `means` (m, n) of its nodes."""
-    info, _, numbers, labels, _, points, _, _ = nodes
-    n, total = points.shape[2], 0.0
-    check_track(track, nodes, 0)
-    check_seen(nodes, seen)
-    check_noise(kind, noise, n)
-    first, end = info[track, FIRST], info[track, COUNT]
-    check(len(means) >= end - first and means.shape[1] == n)
-    space = observation_space(n)
-    out, L = space[0], space[4]
-    for index in range(first, end):
-        at, row = numbers[track, index], 0
-        marks, values = seen[0][at], seen[1][at]
-        while row < labels[at, NUM_ROWS]:
-            observe_at(kind, noise, means[index - first], marks, values, row, space)
-            whiten_rows(marks, values, row, out, L)
-            loss, _ = penalty_and_weight(
-                marks[LOSS, row],
-                values[WIDTH, row],
-                length(out, marks[SIZE, row]),
-            )
-            total += loss
-            row += marks[SIZE, row]
-    return total
 
 
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES}, {SEEN})")

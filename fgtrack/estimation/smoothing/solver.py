@@ -12,9 +12,9 @@ from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.smoothing import (
+    cost_kernels,
     insertion_kernels,
     interpolation_kernels,
-    linearisation_kernels,
     relinearisation_kernels,
     solution_kernels,
 )
@@ -82,20 +82,32 @@ class Solver(Stateful):
         self.nodes.begin_window(track, stamp_ns, mean, covariance)
         self.forget(track)
 
-    # --- solution; subclasses with a factor graph override these methods
+    # --- solution; subclasses with a factor graph override `forget` and `_solve_graphs`
 
     def forget(self, track: int) -> None:
         """Drop the results for a window whose prior, or whole content, has changed."""
+
+    def _solve_graphs(self, tracks: IntArray, firsts: IntArray) -> None:
+        """Solve the factor graphs of windows that `_solve` has solved. The windows began at `firsts` before.
+
+        Raises `numpy.linalg.LinAlgError` if a state is not finite.
+        """
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Solve windows that have changed from `starts` on, and let them begin at `anchors`.
 
         Raises `numpy.linalg.LinAlgError` if a state is not finite.
         """
-        self._solve(tracks, starts, anchors, is_partial=False)
+        firsts = self.nodes.first[tracks]
+        self._solve(tracks, starts, anchors)
+        self._solve_graphs(tracks, firsts)
 
     def _solve(
-        self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool
+        self,
+        tracks: IntArray,
+        starts: IntArray,
+        anchors: IntArray,
+        is_partial: bool = False,
     ) -> None:
         """Solve windows, see `solution_kernels.solve_windows`.
 
@@ -295,6 +307,7 @@ class Solver(Stateful):
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is farther than a threshold from its linearisation point."""
         nodes, far = self.nodes, np.empty(1, dtype=np.int64)
+        moved = tracks[:0]
         for _ in range(max_iterations if len(tracks) else 0):
             starts = np.empty(len(tracks), dtype=np.int64)
             num = relinearisation_kernels.move_far(
@@ -305,8 +318,11 @@ class Solver(Stateful):
             if num < len(tracks):
                 has_moved = starts < NEVER
                 tracks, starts = tracks[has_moved], starts[has_moved]
+            moved = moved if len(moved) else tracks
             nodes.linearise(tracks, starts)
-            self.solve(tracks, starts, nodes.first[tracks])
+            self._solve(tracks, starts, nodes.first[tracks])
+        if len(moved):
+            self._solve_graphs(moved, nodes.first[moved])
 
     def reweight(self, tracks: IntArray) -> None:
         """Take further steps for tracks with a robust loss, whose weights follow the states."""
@@ -321,6 +337,15 @@ class Solver(Stateful):
 
         The linearisation points become `means`, shape (m, n); without `means` they stay.
         """
+        tracks = np.array([track])
+        self._linearise_at(track, means, start)
+        first = self.nodes.first[tracks]
+        self.solve(tracks, first, first)
+
+    def _linearise_at(
+        self, track: int, means: FloatArray | None, start: int = NEVER
+    ) -> None:
+        """Linearise a window as `relinearise` does, and do not solve it."""
         nodes, tracks = self.nodes, np.array([track])
         first = nodes.first[tracks]
         starts = np.minimum(first, start)
@@ -331,7 +356,6 @@ class Solver(Stateful):
         nodes.labels[numbers, STALE] = nodes.labels[numbers, ROWS_STALE] = 1
         nodes.linearise(tracks, starts)
         self._refilter(tracks, starts, first)
-        self.solve(tracks, first, first)
 
     def converge(self, track: int, max_iterations: int = 100) -> None:
         """Relinearise a window at its solution and solve it, until no state moves by more than rounding.
@@ -339,13 +363,16 @@ class Solver(Stateful):
         A step is halved if it is not much shorter than the last step, or does not lower the cost. Process noise
         that depends on the state can make Gauss-Newton oscillate.
         """
+        tracks = np.array([track])
+        first = self.nodes.first[tracks]
         means, last = self.estimates(track), np.inf
         for _ in range(max_iterations):
-            self.relinearise(track, means)
+            self._linearise_at(track, means)
+            self._solve(tracks, first, first)
             steps = self.estimates(track) - means
             longest = float(np.abs(steps).max())
             if longest < STEP_TOLERANCE:
-                return
+                break
             share, most = (
                 1.0 if longest < 0.5 * last else 0.5,
                 self._cost(track, means) * (1.0 + _ROUNDING) + _ROUNDING,
@@ -355,6 +382,7 @@ class Solver(Stateful):
             ):
                 share *= 0.5
             means, last = means + share * steps, longest
+        self._solve_graphs(tracks, first)
 
     def _cost(self, track: int, means: FloatArray) -> float:
         """Return half of the sum of squares of a window at `means` (m, n), with the robust losses of the
@@ -362,7 +390,20 @@ class Solver(Stateful):
 
         The process noise is that of the linearisation points.
         """
-        nodes, n, numbers = self.nodes, self.motion.dim, self.nodes.window(track)
+        nodes, n, compiled = self.nodes, self.motion.dim, self.nodes.compiled
+        if compiled is not None and not nodes.has_plugins:
+            cost_of_window: float = cost_kernels.window_cost(
+                compiled.kind,
+                compiled.noise,
+                track,
+                np.ascontiguousarray(means),
+                nodes.arrays,
+                nodes.seen,
+            )
+            if np.isnan(cost_of_window):
+                raise np.linalg.LinAlgError("a covariance is not positive definite")
+            return cost_of_window
+        numbers = nodes.window(track)
         prior, Q = nodes.predicted[numbers[0]], nodes.Q[numbers[:-1]]
         dt_s = np.diff(nodes.window_stamps_ns(track)) / NS_PER_S
         total = mahalanobis_squared(
@@ -373,27 +414,11 @@ class Solver(Stateful):
             ((noise_root(each) @ gap) ** 2).sum()
             for each, gap in zip(Q, gaps, strict=True)
         )
-        return 0.5 * float(total) + self._measurement_cost(track, means)
-
-    def _measurement_cost(self, track: int, means: FloatArray) -> float:
-        """Return the sum of the losses of the measurements of a window at `means` (m, n)."""
-        nodes = self.nodes
-        compiled = nodes.compiled
-        if compiled is None or nodes.has_plugins:
-            return sum(
-                cost(factor, x, self.motion)
-                for number, x in zip(nodes.window(track).tolist(), means, strict=True)
-                for factor in nodes.factors(number)
-            )
-        total: float = linearisation_kernels.measurement_cost(
-            compiled.kind,
-            compiled.noise,
-            track,
-            np.ascontiguousarray(means),
-            nodes.arrays,
-            nodes.seen,
+        return 0.5 * float(total) + sum(
+            cost(factor, x, self.motion)
+            for number, x in zip(numbers.tolist(), means, strict=True)
+            for factor in nodes.factors(number)
         )
-        return total
 
     def damp(self, tracks: IntArray) -> int:
         """Converge, with damped steps, the tracks whose last step left its linear range. Return the number of

@@ -70,21 +70,11 @@ class BatchSolver(Solver):
         self._graphs.pop(track, None)
         self._read.clear()
 
-    def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
-        """See `Solver.solve`."""
+    def _solve_graphs(self, tracks: IntArray, firsts: IntArray) -> None:
+        """See `Solver._solve_graphs`. Means and covariances then come from the graphs."""
         nodes = self.nodes
         self._read.clear()
-        first = nodes.first[tracks]
-        is_leaving = first < anchors
-        if is_leaving.any():
-            self._solve(
-                tracks[is_leaving],
-                first[is_leaving],
-                anchors[is_leaving],
-                is_partial=True,
-            )
-        nodes.first[tracks] = anchors
-        nodes.tracks[tracks, KNOWN] = anchors  # the states that were read last
+        nodes.tracks[tracks, KNOWN] = nodes.first[tracks]
         try:
             for track in tracks.tolist():
                 self._update(track)

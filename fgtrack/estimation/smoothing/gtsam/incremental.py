@@ -135,12 +135,10 @@ class IncrementalSolver(Solver):
         """See `Solver.forget`: the next solution makes a new graph."""
         self._graphs.pop(track, None)
 
-    def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
-        """See `Solver.solve`."""
-        first = self.nodes.first[tracks]
-        super().solve(tracks, starts, anchors)
+    def _solve_graphs(self, tracks: IntArray, firsts: IntArray) -> None:
+        """See `Solver._solve_graphs`. Means then come from the graphs."""
         try:
-            self._update(tracks, first)
+            self._update(tracks, firsts)
         except (RuntimeError, ValueError, IndexError) as error:
             for track in tracks.tolist():  # its graph may lack nodes
                 self.forget(track)
