@@ -236,8 +236,7 @@ _COLUMNS = (
         for k, lag_s in enumerate(LAGS_S)
         if k
     ),
-    Column("ANEES", "anees"),
-    Column("ANEES, 95 %", "anees_low anees_high", "{} to {}", is_extra=True),
+    Column("ANEES", "anees anees_low anees_high", "{} ({} to {})"),
     Column("order", text=lambda value: _scientific(value)),
     Column("not\nfused", "refused"),
     Column("time\n[us]", "seconds", scale=_US),

@@ -5,6 +5,7 @@ import math
 import os
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from typer.testing import CliRunner
 from fgtrack.cli.main import app
 from fgtrack.core.errors import CallError
 from fgtrack.ranking.files import read_states, write_exact, write_problem
-from fgtrack.ranking.judge import permuted
-from fgtrack.ranking.methods import Answers
-from fgtrack.ranking.problem import LAGS_S, Problem
+from fgtrack.ranking.judge import judge, permuted
+from fgtrack.ranking.methods import Answers, Shipped
+from fgtrack.ranking.problem import LAGS_S, Arrival, Problem
 from fgtrack.ranking.public import MethodLike, method
 from fgtrack.ranking.public import rank as ranked
 from fgtrack.ranking.result import EXACT, Result
@@ -200,6 +201,47 @@ def test_a_sabotaged_copy_of_an_exact_method_is_named_by_its_deviation(
         r"present estimate departs by up to [0-9.e-]+ standard deviations",
         result.sentence,
     )
+
+
+class Sabotaged(Shipped):
+    """A shipped estimator that is given altered measurements."""
+
+    def __init__(self, estimator: str, kind: str) -> None:
+        super().__init__(estimator)
+        self.estimator, self.kind = estimator, kind
+        self.name = f"{estimator}, {kind}"
+
+    def answers(self, problem: Problem) -> Answers:
+        self.name, name = self.estimator, self.name
+        arrivals = tuple(map(self.altered, problem.arrivals))
+        found = super().answers(replace(problem, arrivals=arrivals))
+        self.name = name
+        return found
+
+    def altered(self, arrival: Arrival) -> Arrival:
+        one = arrival.measurement
+        if self.kind == "noise":
+            changed = replace(one, R=1.21 * one.R)
+        elif self.kind == "H":  # z = 1.1 x + noise
+            changed = replace(one, z=one.z / 1.1, R=one.R / 1.21)
+        else:
+            changed = replace(one, stamp_ns=arrival.receipt_ns)
+        return replace(arrival, measurement=changed)
+
+
+@pytest.mark.slow  # sixteen methods
+def test_sabotaged_copies_of_all_exact_estimators_are_named() -> None:
+    exact = ("smoother-banded", "ekf-replay", "ekf-rts", "asd")
+    copies = [Sabotaged(n, k) for n in exact for k in ("noise", "H", "stamped")]
+    found = judge([*map(Shipped, exact), *copies], ["linear"], 2, 1)
+    for result in found.results:
+        assert isinstance(result, Result)
+        if result.method in exact:
+            assert result.deviation < EXACT
+            assert "the present estimate is exact" in result.sentence
+        else:
+            assert result.deviation > 0.01
+            assert "the present estimate departs by up to" in result.sentence
 
 
 def test_a_function_that_uses_later_data_is_refused(tmp_path: Path) -> None:
@@ -463,6 +505,9 @@ def test_the_command_prints_tables_and_writes_a_page_for_each_method(
         "ranking.tex",
     ]
     assert "not fused" in (out / "drop.md").read_text()
+    for name in ("ranking.md", "ranking.tex"):
+        text = (out / name).read_text(encoding="utf-8")
+        assert len(re.findall(r"[\d.]+ \(-?[\d.]+ to [\d.]+\)", text)) == 2 * 2
 
 
 def test_the_page_lists_every_scenario() -> None:
