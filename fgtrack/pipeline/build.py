@@ -55,6 +55,7 @@ from fgtrack.tracking.lives.existence import (
 from fgtrack.tracking.lives.latency import Views, Watermarks
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocess
+from fgtrack.tracking.stamped_facing import StampedFacing
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 #: Stored ego states of the published implementation.
@@ -104,7 +105,7 @@ def build_tracker(
         else None,
         suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,
-        facing=Facing(motion.cartesian) if config.association.reads_yaws else None,
+        facing=_build_facing(config, motion.cartesian),
         road=road,
         watermarks=Watermarks(config.sensors, [EGO]),
     )
@@ -113,6 +114,13 @@ def build_tracker(
         rules = _decision_rules(config)
         return DecidedTracker(parts, Decisions(rules, len(config.sensors)))
     return (PublishedTracker if published_order else MultiObjectTracker)(parts)
+
+
+def _build_facing(config: Config, cartesian: bool) -> Facing | None:
+    """Return the beliefs about fronts; None if every yaw is used as it was measured."""
+    if isinstance(config.association, Hypotheses):
+        return StampedFacing(cartesian, nanoseconds(config.effective.reach_s))
+    return Facing(cartesian) if config.association.reads_yaws else None
 
 
 def _decision_rules(config: Config) -> Rules:

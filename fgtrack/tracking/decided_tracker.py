@@ -27,6 +27,7 @@ from fgtrack.tracking.list_entries import ListEntries
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocessed
 from fgtrack.tracking.replaced_lists import Replaced, tracks_of
+from fgtrack.tracking.stamped_facing import StampedFacing
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 _FIRST_REBUILT = 1_000_000_000
@@ -77,6 +78,7 @@ class DecidedTracker(MultiObjectTracker):
         "_ended",
         "_of",
         "_fused_as",
+        "_beliefs",
         "_unposed",
         "_lists",
         "num_revisions",
@@ -96,6 +98,9 @@ class DecidedTracker(MultiObjectTracker):
         """Published track of each candidate, by the number of its list; None without a track."""
         self._fused_as: dict[tuple[int, int], tuple[int, Measurement, int]] = {}
         """Track in the bank, stack and row of each fused candidate, by the number of its list and its position."""
+        self._beliefs: dict[tuple[int, int], tuple[int, tuple[float, int]]] = {}
+        """Track in the bank, and belief about its front before it has fused a candidate; keys as in `_fused_as`."""
+        self._facing = parts.facing if isinstance(parts.facing, StampedFacing) else None
         self._unposed: list[Batch] = []
         """Lists that could not be placed in the map: no state of the ego was near."""
         self._lists = ListEntries(parts, decisions)
@@ -158,8 +163,14 @@ class DecidedTracker(MultiObjectTracker):
         settled = self.decisions.forget(oldest_ns)
         for each in settled:
             self._lists.settle(each.entry)
-            for position in range(len(self._of.pop(each.entry.number))):
-                self._fused_as.pop((each.entry.number, position), None)
+            number, scan = each.entry.number, each.entry.scan
+            publics = self._of.pop(number)
+            for position in range(len(publics)):
+                self._fused_as.pop((number, position), None)
+                self._beliefs.pop((number, position), None)
+            if self._facing is not None:
+                chosen = [k for k, public in enumerate(publics) if public is not None]
+                self._facing.settle(scan.sensor, scan.stamp_ns, chosen)
         _settle(settled, self._final, self._ended)
         self._tracks.end(self._lives.ended_before(oldest_ns))
         self._unposed = [each for each in self._unposed if each.stamp_ns >= oldest_ns]
@@ -308,9 +319,10 @@ class DecidedTracker(MultiObjectTracker):
         won: list[_Place] = []
         corrected = set[tuple[int, int, int]]()
         for former, own_key in replaced.kept:
-            known = self._fused_as.pop(former, None)
-            if known is not None:
-                self._fused_as[own_key] = known
+            if former in self._fused_as:
+                self._fused_as[own_key] = self._fused_as.pop(former)
+            if former in self._beliefs:
+                self._beliefs[own_key] = self._beliefs.pop(former)
         for each, own in zip(changes, named, strict=True):
             number = each.entry.number
             is_new = each.entry is entry
@@ -375,12 +387,19 @@ class DecidedTracker(MultiObjectTracker):
         anew.update(
             public for _, _, public in stuck if not self._began_before_horizon(public)
         )
+        again_read = []
+        for public, places in self._read_newer(anew, lost, won).items():
+            if self._began_before_horizon(public):
+                again_read += list(filter(self._withdraw, reversed(places)))
+            else:
+                anew.add(public)
         chosen = [
             place
             for place in won
             if place.track not in anew and (*place.detection, place.track) not in stuck
         ]
-        chosen += self._read_again(anew, lost, chosen)
+        chosen += again_read
+        self._go_back([place for place in lost if place.track not in anew], again_read)
         for public in anew:
             bank_id = self._tracks.bank_id(public)
             if bank_id is not None:
@@ -410,44 +429,60 @@ class DecidedTracker(MultiObjectTracker):
                 begun.add(place.track)
                 self._birth(own, place.position, is_again=place.track in anew)
 
-    def _read_again(
+    def _read_newer(
         self, anew: set[int], lost: Sequence[_Place], won: Sequence[_Place]
-    ) -> list[_Place]:
-        """Take measurements that were read from the states of their tracks, and return them.
+    ) -> dict[int, list[_Place]]:
+        """Return the measurements that were read from states of tracks which have changed, by track.
 
-        They are newer than a measurement that the track has lost or won, so they are read from another state now.
+        They are newer than a measurement that the track has lost or won. Tracks in `anew` are left out.
         """
         since: dict[int, int] = {}
         for place in (*lost, *won):
             if place.track not in anew and not self._is_unknown(place.track):
                 stamp_ns = place.entry.batch.stamp_ns
                 since[place.track] = min(since.get(place.track, stamp_ns), stamp_ns)
-        if not since or self.decisions.newest is None:
-            return []
+        newest = self.decisions.newest
+        if newest is None or {id(place.entry) for place in (*lost, *won)} <= {
+            id(newest.entry)
+        }:
+            return {}
+        if not since:
+            return {}
         first_ns = min(since.values())
         newer = [
             each for each in self.decisions.entries if each.batch.stamp_ns >= first_ns
         ]
         if not any(map(self._reads_states, newer)):
-            return []
+            return {}
         taken = {place.key for place in won}
-        found: list[_Place] = []
+        found: dict[int, list[_Place]] = {}
         for public, stamp_ns in since.items():
             own = [
-                _Place(each, position, public)
+                place
                 for each in newer
                 if each.batch.stamp_ns >= stamp_ns
                 for position, track in enumerate(self._of[each.number])
                 if track == public
+                for place in [_Place(each, position, public)]
+                if place.key not in taken and place.key in self._fused_as
             ]
-            own = [place for place in own if place.key not in taken]
             if any(self._reads_states(place.entry) for place in own):
-                found += [
-                    place
-                    for place in reversed(own)
-                    if place.key in self._fused_as and self._withdraw(place)
-                ]
+                found[public] = own
         return found
+
+    def _go_back(self, lost: Sequence[_Place], again_read: Sequence[_Place]) -> None:
+        """Restore the beliefs about the fronts of tracks before the oldest measurement that was taken from them."""
+        if self._facing is None:
+            return
+        restored = set[int]()
+        places = sorted((*lost, *again_read), key=lambda place: place.entry.key)
+        for place in places:
+            bank_id, belief = self._beliefs.pop(place.key, (None, None))
+            if bank_id is None or belief is None or place.track in restored:
+                continue
+            restored.add(place.track)
+            if self._parts.bank.holds(bank_id):
+                self._facing.believe(bank_id, belief)
 
     def _reads_states(self, entry: Entry) -> bool:
         """True for a list whose measurements depend on the states of their tracks."""
@@ -546,8 +581,9 @@ class DecidedTracker(MultiObjectTracker):
             self._tracks.name(bank_id, public)
             candidate = entry.candidates[position]
             self._tracks.begin(bank_id, entry.scan.sensor, start)
-            if parts.facing is not None:
-                parts.facing.born(
+            if self._facing is not None:
+                self._facing.turn_to(start.stamp_ns)
+                self._facing.born(
                     bank_id, entry.scan.sensor, start, candidate.measurement
                 )
             parts.objects.learn(
@@ -577,6 +613,12 @@ class DecidedTracker(MultiObjectTracker):
         pairs = [(p, index[bank_id]) for p, bank_id in chosen if bank_id in index]
         if not pairs:
             return
+        if self._facing is not None:
+            self._facing.turn_to(stamp_ns)
+            for position, track in pairs:
+                bank_id = states.track_ids[track]
+                belief = self._facing.belief(bank_id)
+                self._beliefs[entry.number, position] = bank_id, belief
         assignment = self._readings(entry, pairs, states)
         records: list[Iterable[UpdateRecord]] = []
         kept = self._update.kept = {}

@@ -282,8 +282,8 @@ class Facing(Stateful):
     def _shares_of(self, sensor: str) -> FloatArray:
         shares = self._shares.get(sensor)
         if shares is None:
-            counts = _PRIOR + self._seen.get(sensor, 0.0)
-            shares = self._shares[sensor] = counts / counts.sum()
+            seen = self._seen.get(sensor, np.zeros(3))
+            shares = self._shares[sensor] = shares_of(seen)
         return shares
 
     def born(
@@ -352,7 +352,7 @@ class Facing(Stateful):
                 has_yaw = _kind(each.group.stack.model.components).yaw >= 0
                 of = self._rows_of(states.track_ids)[columns[here]]
                 for k, word in self._learn(
-                    sensor, stamp_ns, of, codes, each.evidence[at], has_yaw
+                    sensor, stamp_ns, of, codes, each.evidence[at], has_yaw, rows[here]
                 ):
                     words[here[k]] = word
         return YawsRead(readings, words) if readings.any() or any(words) else None
@@ -383,8 +383,9 @@ class Facing(Stateful):
         codes: IntArray,
         evidence: FloatArray,
         has_yaw: bool,
+        candidates: IntArray,
     ) -> list[tuple[int, YawWord]]:
-        """Learn from readings (m,) of detections of the tracks in `rows`.
+        """Learn from readings (m,) of the `candidates`, detections of the tracks in `rows`.
 
         Returns the index and the defect of each yaw that has a defect.
         """
@@ -467,6 +468,12 @@ class Facing(Stateful):
         self._free.append(row)
         if self._turned[row]:
             self._ended.add(track_id)
+
+
+def shares_of(seen: FloatArray) -> FloatArray:
+    """Return the shares of yaws that are right, flipped and anything, from their numbers `seen`, both shape (3,)."""
+    counts = _PRIOR + seen
+    return np.asarray(counts / counts.sum())
 
 
 def _learns(group: Group) -> bool:

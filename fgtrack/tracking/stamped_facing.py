@@ -1,0 +1,103 @@
+"""Fronts of tracks whose yaws may be read once more: beliefs and shares in the order of stamps."""
+
+from bisect import bisect_left
+from collections.abc import Iterable
+from operator import itemgetter
+from typing import ClassVar
+
+import numpy as np
+
+from fgtrack.core.types import FloatArray, IntArray, YawWord
+from fgtrack.tracking.facing import MEMORY, Facing, shares_of
+
+_stamp = itemgetter(0)
+
+
+class StampedFacing(Facing):
+    """Belief about the front of each track, which does not depend on the order of arrival.
+
+    A reading depends on the older detections of its track, and on the shares of wrong yaws of its sensor. The shares at
+    a stamp are those of the lists that are older by more than the horizon: no late list can change these lists.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *Facing.STATE,
+        "_noted",
+        "_settled",
+        "_stamp_ns",
+    )
+
+    def __init__(self, cartesian: bool, horizon_ns: int) -> None:
+        """`horizon_ns`: time after which a list is decided for good."""
+        super().__init__(cartesian)
+        self._horizon_ns = horizon_ns
+        # Flipped and other shares of the yaws of each list, by sensor and stamp, and by the index of the candidate.
+        self._noted: dict[tuple[str, int], dict[int, tuple[float, float]]] = {}
+        # Stamps of the lists that are decided for good, and the numbers of yaws after them, by sensor.
+        self._settled: dict[str, list[tuple[int, FloatArray]]] = {}
+        self._stamp_ns = 0
+
+    def turn_to(self, stamp_ns: int) -> None:
+        """Use the shares of wrong yaws at a stamp."""
+        self._stamp_ns = stamp_ns
+
+    def belief(self, track_id: int) -> tuple[float, int]:
+        """Return the log-odds of the front of a track, and their stamp."""
+        row = self._rows[track_id]
+        return float(self._log_odds[row]), int(self._stamps_ns[row])
+
+    def believe(self, track_id: int, belief: tuple[float, int]) -> None:
+        """Go back to an earlier `belief`."""
+        row = self._rows[track_id]
+        self._log_odds[row], self._stamps_ns[row] = belief
+        self._least_log_odds = None
+
+    def settle(self, sensor: str, stamp_ns: int, chosen: Iterable[int]) -> None:
+        """Learn the shares from a list that is decided for good: from the `chosen` candidates, which have tracks."""
+        noted = self._noted.pop((sensor, stamp_ns), None)
+        if noted is None:
+            return
+        history = self._settled.setdefault(sensor, [])
+        seen = history[-1][1] if history else np.zeros(3)
+        for position in chosen:
+            if position in noted:
+                flipped, other = noted[position]
+                kept = min(1.0, MEMORY / (float(seen.sum()) + 1.0))
+                seen = kept * seen + [1.0 - flipped - other, flipped, other]
+        history.append((stamp_ns, seen))
+        oldest_ns = stamp_ns - 2 * self._horizon_ns
+        while len(history) > 1 and history[1][0] < oldest_ns:
+            history.pop(0)
+
+    def _shares_of(self, sensor: str) -> FloatArray:
+        """See `Facing._shares_of`."""
+        history = self._settled.get(sensor, [])
+        row = bisect_left(history, self._stamp_ns - self._horizon_ns, key=_stamp)
+        return shares_of(history[row - 1][1] if row else np.zeros(3))
+
+    def _learn(
+        self,
+        sensor: str,
+        stamp_ns: int,
+        rows: IntArray,
+        codes: IntArray,
+        evidence: FloatArray,
+        has_yaw: bool,
+        candidates: IntArray,
+    ) -> list[tuple[int, YawWord]]:
+        """See `Facing._learn`. A yaw that is read once more is counted once."""
+        before = {name: own.copy() for name, own in self.counts.items()}
+        words = super()._learn(
+            sensor, stamp_ns, rows, codes, evidence, has_yaw, candidates
+        )
+        if not has_yaw:
+            return words
+        noted = self._noted.setdefault((sensor, stamp_ns), {})
+        is_known = noted.keys() >= set(candidates.tolist())
+        if is_known and sensor in before:
+            self.counts[sensor] = before[sensor]
+        for position, (_, flipped, other) in zip(
+            candidates.tolist(), evidence.tolist(), strict=True
+        ):
+            noted[position] = flipped, other
+        return words
