@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fgtrack.config.motion import NOISE_HZ, MotionConfig
 from fgtrack.config.recorded import Recorded, RecordedSensor, recorded
 from fgtrack.config.settings import ClockConfig, Config, FilterConfig
 from fgtrack.config.yaml_file import SMALLEST, plain
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import MEASURABLE, DetectionList, Message
+from fgtrack.core.types import MEASURABLE, DetectionList, FloatArray, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.inputs.source import InputSource
 from fgtrack.meaning.assumption import Assumed, Assumption, departures, is_given
@@ -21,9 +23,10 @@ from fgtrack.meaning.corrected import corrected_message
 from fgtrack.meaning.coverage import Coverage, coverages
 from fgtrack.meaning.scattered_noise import Scatter, scattered_noise
 from fgtrack.meaning.single_reports import SingleReports
-from fgtrack.meaning.tracklets import points_of
+from fgtrack.meaning.tracklets import points_of, speeds_mps
 from fgtrack.models.sensors import Mount
 from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.lives.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "assumed", "is_open", "source_of", "unmodelled_sensors"]
@@ -51,6 +54,10 @@ _LARGEST_TURN_MPS2 = 30.0
 #: Widest interval of a standard deviation that counts, as a share of it, and least share of the usual value.
 _WIDEST = 0.3
 _LEAST_OF_USUAL = 0.1
+#: Fewest tracklets that show speeds, their quantile, and the least standard deviation of the speed of a new track.
+_FEWEST_TRACKLETS = 10
+_FAST = 0.95
+_LEAST_SPEED_MPS = 15.0
 _LEAST_CLUTTER = 0.05
 """Smallest assumed number of false detections in a list; fewer cannot be excluded."""
 #: Share of time-correlated errors in the variance: smaller shares are not modelled, larger ones are limited.
@@ -110,7 +117,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
             _lists,
             lambda config, _: _recorded(config, carried),
         ]
-        rules += [_claim, _offsets, _unplaced, _windows]
+        rules += [_births, _claim, _offsets, _unplaced, _windows]
         if not unmodelled:
             rules = []
             covered = {
@@ -209,15 +216,26 @@ def _covered(
             untested = reasons.keys() - linked.std.keys()
             reasons = {key: reasons[key] for key in untested} | linked.uninformative
         scatter: Mapping[str, Scatter] = {}
+        speed_mps = None
         if name in unmodelled and name in points and linked is None:
             scatter = scattered_noise(points[name])
+            mount = mounts.get(name) or Mount()
+            speed_mps = _fast_mps(speeds_mps(points[name], mount.yaw_rad))
         result[name] = replace(
             one,
             measured=one.measured - reasons.keys(),
             uninformative=reasons,
             scatter=scatter,
+            speed_mps=speed_mps,
         )
     return dict(sorted(result.items()))
+
+
+def _fast_mps(speeds: FloatArray) -> float | None:
+    """Return the speed that nearly all tracklets stay below; None with few tracklets."""
+    if len(speeds) < _FEWEST_TRACKLETS:
+        return None
+    return float(np.quantile(speeds, _FAST))
 
 
 def _sensor(name: str, reason: str, **settings: object) -> Iterator[Assumption]:
@@ -481,6 +499,26 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
             density = max(float(f"{one.density_per_m2:.2g}"), SMALLEST)
             reason = "mean number of detections in a list, over their area"
             yield from _sensor(name, reason, clutter_per_m2=density)
+
+
+def _births(config: Config, covered: Coverages) -> Iterator[Assumption]:
+    """Yield the standard deviation of the speed of a new track, by the speeds of the objects of all sensors.
+
+    The default excludes no airliner. With it, the first detections of a car are weak
+    evidence, and its first velocity is as wrong as two positions make it.
+    """
+    used = [
+        item
+        for item in covered.values()
+        if item.num_lists and not item.measured.isdisjoint(("x_m", "range_m"))
+    ]
+    speeds = [item.speed_mps for item in used if item.speed_mps is not None]
+    if not speeds or len(speeds) < len(used) or config.birth != Birth():
+        return
+    std_mps = float(math.ceil(max(*speeds, _LEAST_SPEED_MPS)))
+    if std_mps < Birth().speed_std_mps:
+        reason = f"95 % of the tracklets are slower than {max(speeds):.2g} m/s"
+        yield Assumption(("birth", "speed_std_mps"), std_mps, reason)
 
 
 def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:

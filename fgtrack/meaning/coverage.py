@@ -115,6 +115,8 @@ class Coverage:
     """Objects of a sensor that reports them one by one; None for a sensor that scans, or with too few reports."""
     scatter: Mapping[str, Scatter] = field(default_factory=dict)
     """Noise of the components by the scatter of the detections of objects around straight lines."""
+    speed_mps: float | None = None
+    """Speed in the map that 95 % of the tracklets stay below; None with few tracklets."""
     disagreement_m: float | None = None
     """Smallest standard deviation between positions of this and another sensor; None without common objects."""
     unexplained_m: float = 0.0

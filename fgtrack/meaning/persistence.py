@@ -37,6 +37,8 @@ _CORE = 3.5
 """Largest second difference of one object's positions, in multiples of the scale: 99.8 % of a Rayleigh distribution."""
 _LEAST_STD_M = 0.02
 """Smallest scatter: exact positions of a simulator differ from a straight line by rounding and by manoeuvres."""
+#: Bisections of the share of clutter.
+_BISECTIONS = 30
 _PROBABILITY = (0.1, 0.9)
 """Bounds of the estimated detection probability, which is uncertain because occlusions last for several lists."""
 
@@ -234,20 +236,31 @@ def _near_clutter_per_m2(
 ) -> float:
     """Density of clutter in a list near clutter of the list before.
 
-    `model` and `scores` give the probability that a detection is clutter. `odds` are the
-    odds of clutter before the score is known. `trees` contain the positions of each list.
+    `model` and `scores` give the ratios of likelihoods of objects and clutter. `odds` are
+    the odds of clutter before the score is known. `trees` contain the positions of each
+    list. Two near detections of successive lists are both of objects, or both of clutter.
+    The share of pairs of clutter is the most likely one of their scores.
     """
     ratios = [
         np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale)
         for item in scores
     ]
-    of_clutter = [odds / (odds + ratio) for ratio in ratios]
-    total = sum(float(item.sum()) for item in of_clutter[:-1])
-    together = 0.0
-    for (tree, own), (after, others) in pairwise(zip(trees, of_clutter, strict=True)):
-        for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
-            together += float(own[i] * others[near].sum())
-    return together / (total * math.pi * _LARGEST_ERROR_M**2) if total else 0.0
+    total = sum(float((odds / (odds + item)).sum()) for item in ratios[:-1])
+    of_pairs = [
+        own[i] * others[near]
+        for (tree, own), (after, others) in pairwise(zip(trees, ratios, strict=True))
+        for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M))
+    ]
+    if not of_pairs or not total:
+        return 0.0
+    pairs = np.concatenate(of_pairs)
+    low, high = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        share = 0.5 * (low + high)
+        # Derivative of the log-likelihood, which falls.
+        slope = float(np.mean((1.0 - pairs) / (share + (1.0 - share) * pairs)))
+        low, high = (share, high) if slope > 0.0 else (low, share)
+    return low * len(pairs) / (total * math.pi * _LARGEST_ERROR_M**2)
 
 
 def _best(

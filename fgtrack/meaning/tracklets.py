@@ -10,10 +10,11 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from fgtrack.core.geometry import rotations
+from fgtrack.core.geometry import rotation, rotations
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
     Detection,
@@ -31,6 +32,7 @@ __all__ = [
     "Points",
     "points_of",
     "sights_m",
+    "speeds_mps",
     "tracklets",
     "triples",
 ]
@@ -54,6 +56,8 @@ _ACCEL_MPS2 = 4.0
 _USUAL = (Trend(0.5, 0.03), Trend(0.4, 0.015))
 _SMALLEST_M = 0.02
 _FEWEST_TRIPLES = 40
+#: Half of the number of detections over which the speed of a tracklet is computed.
+_SPEED_LAG = 3
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,7 @@ class Points:
     values: Mapping[str, FloatArray] = field(default_factory=dict)
     """Other components by name, each of shape (n,); NaN where missing."""
 
-    @property
+    @cached_property
     def turned_m(self) -> FloatArray:
         """Positions, turned by the ego's yaw: smooth for every mount; positions in the map are unchanged."""
         if self.in_map:
@@ -133,8 +137,15 @@ class Points:
         turns = rotations(self.poses[:, 2])
         return np.asarray(np.einsum("nij,nj->ni", turns, self.points_m))
 
+    @cached_property
+    def linked(self) -> tuple[IntArray, Noise]:
+        """Tracklet of each detection, shape (n,), or -1, and the noise of the sensor."""
+        return _linked(self)
+
     def read_in_map(self, in_map: bool) -> "Points":
         """Return the same numbers, read as positions in the map, or in the frame of the ego or the sensor."""
+        if in_map == self.in_map:
+            return self
         return replace(self, in_map=in_map)
 
 
@@ -234,8 +245,13 @@ def tracklets(points: Points) -> tuple[IntArray, Noise]:
     """Return the tracklet of each detection, shape (n,), and the noise of the sensor; -1 for no tracklet.
 
     The noise is estimated from triples of a first association, and used in a second
-    one.
+    one. The result is computed once for each object `points`.
     """
+    return points.linked
+
+
+def _linked(points: Points) -> tuple[IntArray, Noise]:
+    """Return the result of `tracklets`."""
     noise = Noise()
     first = _chains(points, noise)
     noise = _noise(points, first, noise)
@@ -349,3 +365,21 @@ def triples(points: Points, chains: IntArray, lag: int = 1) -> IntArray:
         else [order[:0]] * 3
     )
     return np.asarray(rows[chains[rows[:, 0]] == chains[rows[:, 2]]])
+
+
+def speeds_mps(points: Points, yaw_rad: float = 0.0) -> FloatArray:
+    """Return the median speed in the map of each tracklet that is long enough, shape (n,).
+
+    `yaw_rad` is the yaw of the sensor on the ego. The lever arm has no influence on
+    straight roads, and a small influence in turns.
+    """
+    chains, _ = tracklets(points)
+    rows = triples(points, chains, _SPEED_LAG)[:, [0, 2]]
+    elapsed_s = np.diff(points.stamps_s[rows], axis=1)
+    moved_m = np.diff(points.turned_m[rows], axis=1)[:, 0]
+    if not points.in_map:
+        moved_m = moved_m @ rotation(yaw_rad).T
+        moved_m += np.diff(points.poses[rows, :2], axis=1)[:, 0]
+    speeds = np.hypot(*moved_m.T) / np.maximum(elapsed_s[:, 0], 1e-9)
+    numbers = chains[rows[:, 0]]
+    return np.array([np.median(speeds[numbers == each]) for each in np.unique(numbers)])

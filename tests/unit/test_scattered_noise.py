@@ -141,3 +141,35 @@ def test_boxes_of_a_lone_sensor_keep_the_usual_noise():
         )
 
     assert _draft(measure).config.sensors["sensor"].std == {"x_m": 0.3, "y_m": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "expected_mps"), [(30.0, 30.0), (3.0, 15.0), (69.0, 69.0)]
+)
+def test_new_tracks_are_expected_to_be_as_fast_as_the_objects(speed_mps, expected_mps):
+    rng = np.random.default_rng(5)
+
+    def lists():
+        for number in range(400):
+            stamp_s = number * _PERIOD_S
+            stamp_ns = round(1e9 * stamp_s)
+            # The ego drives at 10 m/s; a car appears every 2 s, and stays for 3 s.
+            yield EgoState(stamp_ns, stamp_ns, 10.0 * stamp_s, 0, 0, 10.0, 0, 0)
+            ages_s = stamp_s % 2.0, stamp_s % 2.0 + 2.0
+            cars = [
+                Detection(
+                    x_m=(speed_mps - 10.0) * age_s - 50.0 + 0.1 * rng.normal(),
+                    y_m=4.0 + 0.1 * rng.normal(),
+                )
+                for age_s in ages_s
+                if age_s < 3.0 and age_s <= stamp_s
+            ]
+            yield DetectionList("sensor", stamp_ns, stamp_ns + 1, cars, frame="ego")
+
+    draft = assumed(Config(), source_of(lists))
+    assert draft.config.birth.speed_std_mps == pytest.approx(expected_mps, rel=0.06)
+
+
+def test_few_objects_show_no_speed():
+    draft = _draft(lambda x_m, y_m, *_: Detection(x_m=x_m, y_m=y_m))
+    assert draft.config.birth == Config().birth
