@@ -85,7 +85,7 @@ class Agreement:
 
     @property
     def is_off(self) -> bool:
-        """True if the sensors disagree: the known displacement exceeds `limit_m` plus `half_m`."""
+        """True if the sensors disagree: the displacement is known, and longer than `limit_m` plus `half_m`."""
         return self.is_known and self.distance_m > self.limit_m + self.half_m
 
     def __str__(self) -> str:

@@ -106,7 +106,7 @@ class Arrivals:
 
     @property
     def is_receipt(self) -> bool:
-        """True if every stamp equals the receipt to 1 us."""
+        """True if every stamp equals its receipt up to 1 us."""
         return bool(np.all(np.abs(self.receipts_ns - self.stamps_ns) <= 1000))
 
     def quantile_s(self, share: float) -> float:

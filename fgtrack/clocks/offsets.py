@@ -187,7 +187,7 @@ class OffsetReport:
         return [item for item in self.sensors if item.sensor != self.reference]
 
     def surely_late_s(self, one: SensorOffset) -> float | None:
-        """Return the time by which the stamps of one of the two sensors are late for certain.
+        """Return the time by which the stamps of the sensor of `one`, or of the reference, are late for certain.
 
         Positive if the stamps of the sensor of `one` are late, negative if the stamps of the reference are. None if
         either clock may be wrong, or if the offset is not significant.

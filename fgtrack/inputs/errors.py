@@ -10,7 +10,7 @@ _T = TypeVar("_T")
 
 
 def one_line(error: BaseException) -> str:
-    """Text of `error` on one line of at most 200 characters; the type's name if it has no text."""
+    """Return the text of `error` on one line of at most 200 characters; the type's name if there is no text."""
     return " ".join(str(error)[:2000].split())[:200] or type(error).__name__
 
 
@@ -64,7 +64,7 @@ class TruncatedInput(DataError):  # noqa: N818 - the name describes the input
 
 
 class UntilBreak(Generic[_T]):
-    """Iterator over messages up to their end, or up to a `DataError`, which is kept in `error`.
+    """Iterator over messages. A `DataError` ends it as the last message does, and is kept in `error`.
 
     A `DataError` before the first message is raised, unless it is a `TruncatedInput`.
     """

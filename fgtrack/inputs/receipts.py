@@ -45,7 +45,7 @@ class _Sorter(Generic[_Item]):
         self._far_newest_ns = 0
 
     def neutral(self, item: _Item) -> Iterator[tuple[_Item, bool]]:
-        """Take an item without a receipt, and yield the items that are decided now, each with True if it is wrong."""
+        """Take an item without a receipt. Yield items as `take` does."""
         if self._far:
             self._far.append((item, False))
         elif self._head:
@@ -54,7 +54,7 @@ class _Sorter(Generic[_Item]):
             yield item, False
 
     def take(self, item: _Item, receipt_ns: int) -> Iterator[tuple[_Item, bool]]:
-        """Take an item, and yield the items that are decided now, each with True if it is wrong."""
+        """Take an item. Yield the items whose receipts are judged by now, each with True if its receipt is wrong."""
         newest_ns = receipt_ns if self._newest_ns is None else self._newest_ns
         far_ns = _FAR_NS if newest_ns else _FAR_FROM_ZERO_NS
         if abs(receipt_ns - newest_ns) > far_ns:

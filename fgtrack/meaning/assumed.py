@@ -186,7 +186,7 @@ def _is_free(
 def _covered(
     source: InputSource, config: Config, mounts: Mapping[str, Mount]
 ) -> Coverages:
-    """Coverage of all sensors in the recording or in `config.input`, without ignored sensors."""
+    """Return the coverage of all sensors in the recording or in `config.input`, without ignored sensors."""
 
     first: list[Message] = []
 
@@ -302,13 +302,13 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _prediction_s(one: Coverage) -> float:
-    """Time over which the heading of an object is predicted, with the age of its estimate; 0 if unknown."""
+    """Return the time over which the heading of an object is predicted, with the age of its estimate; 0 if unknown."""
     age_s = 0.0 if one.reports is None else _heading_age_s(one.reports)
     return (one.revisit_s or 0.0) + age_s
 
 
 def _turn_mps2(one: Coverage) -> float:
-    """Acceleration of a turn that the default model assumes at the speed of single reports.
+    """Return the acceleration of a turn that the default model assumes at the speed of single reports.
 
     0 for other sensors, and for reports that are exact enough to show a turn within two
     periods.
@@ -626,7 +626,9 @@ def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _late_s(used: Iterable[Coverage]) -> float:
-    """Delay that a window must hold, in whole seconds; longer delays than `_LONGEST_DELAY_S` are clock errors."""
+    """Return the delay that a window must hold, in whole seconds; longer delays than `_LONGEST_DELAY_S` are clock
+    errors.
+    """
     delays_s = (math.ceil(1.2 * item.delay_s) for item in used)
     return float(
         max((each for each in delays_s if each <= _LONGEST_DELAY_S), default=0)

@@ -97,7 +97,7 @@ class Assumed:
         head: Iterable[str] = (),
         comments: Iterable[tuple[Sequence[str], str]] = (),
     ) -> str:
-        """YAML text of all settings that differ from the defaults; assumptions have their reason as a comment.
+        """Return all settings that differ from the defaults as YAML; the comment of an assumption is its reason.
 
         `head` contains comment lines for the beginning, `comments` further comments by
         the path of their key.

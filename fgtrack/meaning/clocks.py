@@ -44,7 +44,7 @@ def clock_decisions(sample: Sample) -> Iterator[Decision]:
 
 
 def _times(messages: Sequence[Message]) -> Mapping[str, tuple[IntArray, IntArray]]:
-    """Stamps and receipts, shape (n,) each, in the order of receipt, of the ego and of each sensor."""
+    """Return stamps and receipts, shape (n,) each, in the order of receipt, of the ego and of each sensor."""
     rows: dict[str, list[tuple[int, int]]] = {}
     for message in messages:
         if isinstance(message, EgoState):

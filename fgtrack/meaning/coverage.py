@@ -370,7 +370,8 @@ class _Detections:
 def _revisit_s(
     stamps_ns: Sequence[int], points_m: Sequence[FloatArray]
 ) -> float | None:
-    """Median time since the last list with a detection that could be the same object; None for too few revisits.
+    """Return the median time since the last list with a detection that could be the same object; None for too few
+    revisits.
 
     The lists are in order of receipt.
     """
@@ -400,7 +401,7 @@ def _revisit_s(
 
 
 def _position(detection: Detection) -> tuple[float, float, float]:
-    """x, y and 1 for a position; cosine, sine and 0 for a bearing without a range; NaN if there is neither."""
+    """Return x, y and 1 for a position; cosine, sine and 0 for a bearing without a range; NaN if there is neither."""
     if detection.x_m is not None and detection.y_m is not None:
         return detection.x_m, detection.y_m, 1.0
     if detection.bearing_rad is None:
@@ -412,7 +413,7 @@ def _position(detection: Detection) -> tuple[float, float, float]:
 
 
 def _without_strays(points_m: FloatArray) -> BoolArray:
-    """Mask (n,) of the positions (n, 2) that are not far from all others."""
+    """Return True for each of the positions (n, 2) that is not far from all others, shape (n,)."""
     if not len(points_m):
         return np.zeros(0, dtype=bool)
     distances_m = np.hypot(*(points_m - np.median(points_m, axis=0)).T)
@@ -421,7 +422,9 @@ def _without_strays(points_m: FloatArray) -> BoolArray:
 
 
 def _grid_std_m(points_m: FloatArray) -> float:
-    """Standard deviation of the rounding to a grid, in x, y or range, of positions (n, 2); 0 without a grid."""
+    """Return the standard deviation of the rounding to a grid, in x, y or range, of positions (n, 2); 0 without a
+    grid.
+    """
     steps_m = [0.0]
     for values in (*points_m.T, np.hypot(*points_m.T)):
         coordinates = np.unique(np.round(values, 6))
@@ -445,7 +448,8 @@ def _rotated(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
 
 
 def _recurring(points: FloatArray, numbers: IntArray) -> BoolArray:
-    """Mask (n,) of the recurring detections: another list has a detection in the same cell of either grid.
+    """Return True for each detection that recurs, shape (n,): another list has a detection in the same cell of
+    either grid.
 
     The two grids are shifted by half a cell. `points`, shape (n, 3), are in units of
     the cells, `numbers` are the indices of their lists.
@@ -461,7 +465,9 @@ def _recurring(points: FloatArray, numbers: IntArray) -> BoolArray:
 
 
 def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] | None:
-    """Axis and full angle of the sector that contains the bearings; None if it is too wide to be distinguished."""
+    """Return axis and full angle of the sector that contains the bearings; None if it is too wide to be
+    distinguished.
+    """
     rising = np.sort(wrap_angles(bearings_rad))
     skip = 1 + int(_OUTSIDE * len(rising))
     ends = np.append(rising, rising[:skip] + math.tau)

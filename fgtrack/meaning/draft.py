@@ -358,7 +358,7 @@ def _readable(
 
 
 def _ego_states(path: Path, part: InputPart) -> Iterator[EgoState]:
-    """Yield the states of the ego that `part` gives, up to a break."""
+    """Yield the states of the ego in `part`, until the recording breaks off."""
     with suppress(FgtrackError):
         source = open_input(path, _with_parts(InputConfig(), [part]))
         for message in source.messages():

@@ -29,7 +29,7 @@ _FLAT = 0.2
 
 
 class FrameTest(NamedTuple):
-    """Result of a test of the frames `map` and `ego`; the ego's frame stands for the sensor's too."""
+    """Result of a test whether positions are in the frame `map` or `ego`; `ego` also stands for the sensor's frame."""
 
     in_map: bool | None
     """True for the map, False for the ego or the sensor; None if the test does not decide."""

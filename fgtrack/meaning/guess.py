@@ -189,7 +189,9 @@ class Guess:
 
 
 def words_of(name: str) -> list[str]:
-    """Words in the name of a column or in the path of a field, in lower case; units have one word (`km/h`: `kmh`)."""
+    """Return the words in the name of a column or in the path of a field, in lower case; units have one word
+    (`km/h`: `kmh`).
+    """
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().replace("°", "deg")
     for pattern, unit in _UNIT_TEXTS.items():
         text = re.sub(pattern, f" {unit} ", text)
@@ -257,7 +259,7 @@ def _with_tiny_degrees(
 
 
 def _quaternion(values: Mapping[str, Sequence[float]]) -> Guess | None:
-    """Guess of the heading from four fields of a quaternion; None without such fields."""
+    """Return a guess of the heading from four fields of a quaternion; None without such fields."""
     fields: dict[str, dict[str, str]] = {}
     for name in values:
         if match := _QUATERNION.fullmatch(name):
@@ -328,7 +330,9 @@ def agreeing_with_motion(
 
 
 def _speed(guess: Guess, raw: FloatArray, step_mps: FloatArray) -> Guess:
-    """Guess of the speed in the unit that agrees with the distance travelled; `guess` if it agrees, or none does."""
+    """Return the guess of the speed in the unit that agrees with the distance travelled; `guess` if no other unit
+    agrees.
+    """
     path = guess.path if isinstance(guess.path, Field) else Field(guess.path)
     if not isinstance(path.path, str):
         return guess
@@ -343,7 +347,7 @@ def _speed(guess: Guess, raw: FloatArray, step_mps: FloatArray) -> Guess:
 
 
 def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
-    """Guess of the heading with the convention that agrees best with the course; `guess` if none agrees."""
+    """Return the guess of the heading with the convention that agrees best with the course; `guess` if none agrees."""
     degrees = isinstance(guess.path, Field) and guess.path.degrees
     quarter = 90.0 if degrees else 0.5 * math.pi
     options = [
@@ -404,7 +408,9 @@ def _component(name: str) -> tuple[str | None, str]:
 
 
 def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -> Guess:
-    """Guess of a component from the field `name`, with the conversion that its unit and its values require."""
+    """Return the guess of a component from the field `name`, with the conversion that its unit and its values
+    require.
+    """
     finite = [value for value in samples if math.isfinite(value)]
     spread = f"{min(finite):.4g} to {max(finite):.4g}" if finite else "no numbers"
     if component in ("stamp", "receipt", "object_id", "id", "class_name"):

@@ -43,7 +43,7 @@ class Scans:
     """x, y and yaw (unwrapped) of the frame in the map at each stamp, shape (n, 3); zero for lists in the map."""
 
     def in_map_m(self, k: int) -> FloatArray:
-        """Positions of list `k` in the map, shape (m, 2)."""
+        """Return the positions of list `k` in the map, shape (m, 2)."""
         x_m, y_m, yaw_rad = self.poses[k]
         c = math.cos(yaw_rad)
         s = math.sin(yaw_rad)
@@ -188,7 +188,7 @@ def _of_equal_ids(ids: Sequence[IntArray]) -> Iterator[tuple[IntArray, IntArray]
 
 
 def _line(times_s: FloatArray, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (2,) and slope (2,) of the straight line through `points_m` (p, 2)."""
+    """Return mean (2,) and slope (2,) of the straight line through `points_m` (p, 2)."""
     centred_s = times_s - times_s.mean()
     mean_m = points_m.mean(axis=0)
     spread_s2 = float(centred_s @ centred_s)
@@ -252,7 +252,7 @@ def _motion(scans: Scans, rates: FloatArray, one: StraightPath) -> FloatArray:
 
 
 def _rates(scans: Scans) -> FloatArray:
-    """Velocity in the map and yaw rate of the frame at each stamp, shape (n, 3)."""
+    """Return the velocity in the map and yaw rate of the frame at each stamp, shape (n, 3)."""
     stamps_s = scans.stamps_s
     if len(stamps_s) < 2 or not scans.poses.any():
         return np.zeros((len(stamps_s), 3))

@@ -114,7 +114,7 @@ def filtered(rows: Rows) -> Fit:
 
 
 def _covariances(rows: Rows, at: IntArray, seen_m: FloatArray) -> FloatArray:
-    """Covariances of the detections `at`, shape (m, 2, 2), of objects at `seen_m` (m, 2)."""
+    """Return the covariances of the detections `at`, shape (m, 2, 2); `seen_m` (m, 2) are positions of objects."""
     sight_m = seen_m - rows.origins_m[at]
     square_m2 = np.square(sight_m).sum(axis=1)
     noise = np.square(rows.noise[at])
@@ -140,7 +140,7 @@ def _predict(
 
 
 def _inverse(S: FloatArray) -> FloatArray:
-    """Inverse of symmetric matrices, shape (m, 2, 2), in closed form."""
+    """Return the inverse of symmetric matrices, shape (m, 2, 2), in closed form."""
     a = S[:, 0, 0]
     b = S[:, 0, 1]
     d = S[:, 1, 1]

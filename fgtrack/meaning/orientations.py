@@ -113,14 +113,16 @@ def yaw_meaning(
 
 
 def _from(angles_rad: FloatArray, centre_rad: float) -> FloatArray:
-    """Differences of `angles_rad`, shape (n,), from `centre_rad`, in (-pi, pi]."""
+    """Return the differences of `angles_rad`, shape (n,), from `centre_rad`, in (-pi, pi]."""
     return np.asarray(
         np.arctan2(np.sin(angles_rad - centre_rad), np.cos(angles_rad - centre_rad))
     )
 
 
 def _num_different(scans: Scans) -> int:
-    """Number of different orientations, in the frame of the lists or in the map; the smaller number counts."""
+    """Return the number of different orientations, in the frame of the lists or in the map; the smaller number
+    counts.
+    """
     counts = []
     for in_map in (False, True):
         angles = np.concatenate(

@@ -87,7 +87,8 @@ class Persistence:
 
 
 def disagreement_m(one: Persistence, other: Lists) -> float | None:
-    """Standard deviation on each axis between positions of the objects of `one` and their detections in `other`.
+    """Return the standard deviation on each axis between positions of the objects of `one` and their detections in
+    `other`.
 
     `other` contains the lists of another sensor. Pairs are mutual nearest neighbours.
     Returns None if there are few pairs, or if their distances are not clearly smaller
@@ -116,7 +117,7 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
 
 
 def persistence(lists: Lists, grid_std_m: float = 0.0) -> Persistence | None:
-    """Estimate the persistence of detections; None if too few detections recur in successive lists.
+    """Estimate detection probability, clutter and score model; None if too few detections recur in successive lists.
 
     `grid_std_m` is the standard deviation of the rounding of positions to a grid.
     """
@@ -198,7 +199,7 @@ def _crowding_per_m2(
     loose: BoolArray,
     of_clutter: float,
 ) -> float:
-    """Density of false detections near other false detections of the same list.
+    """Return the density of false detections near other false detections of the same list.
 
     `loose` marks detections in no triple; `of_clutter` of them are clutter. `numbers`
     contains the index of the list of each detection.
@@ -216,7 +217,7 @@ def _crowding_per_m2(
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
-    """Range beyond which most triples are not continued; None if there is no such range.
+    """Return the range beyond which most triples are not continued; None if there is no such range.
 
     `ranges_m` and `objects` describe the triples. The entry in `objects` is 0 if a
     triple is not continued, else the number of objects that it stands for, which is
@@ -234,7 +235,7 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
 def _near_clutter_per_m2(
     trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float
 ) -> float:
-    """Density of clutter in a list near clutter of the list before.
+    """Return the density of clutter in a list near clutter of the list before.
 
     `model` and `scores` give the ratios of likelihoods of objects and clutter. `odds` are
     the odds of clutter before the score is known. `trees` contain the positions of each
@@ -310,7 +311,7 @@ def _scale(misfits: FloatArray, start: float = 0.5) -> float:
 def _score(
     scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray
 ) -> Score | None:
-    """Logistic fit to the scores of objects and of clutter, corrected for the ratio of their numbers.
+    """Return a logistic fit to the scores of objects and of clutter, corrected for the ratio of their numbers.
 
     Returns None if there are too few scores, or if higher scores do not belong to
     objects more often.

@@ -49,7 +49,7 @@ def frame_decisions(sample: Sample) -> Iterator[Decision]:
 
 
 def _sensors(sample: Sample) -> list[str]:
-    """Names of the sensors with lists, in their order."""
+    """Return the names of the sensors with lists, in their order."""
     names = {item.sensor for item in sample.messages if isinstance(item, DetectionList)}
     return sorted(names)
 

@@ -89,7 +89,7 @@ def scans_of(
 
 
 def _mounted(poses: FloatArray, mount: Mount) -> FloatArray:
-    """Poses of the sensor in the map, shape (n, 3), for `poses` of the ego."""
+    """Return the poses of the sensor in the map, shape (n, 3), for `poses` of the ego."""
     c = np.cos(poses[:, 2])
     s = np.sin(poses[:, 2])
     return np.column_stack(
@@ -102,7 +102,9 @@ def _mounted(poses: FloatArray, mount: Mount) -> FloatArray:
 
 
 def _path(ego: FloatArray) -> FloatArray | None:
-    """Seconds, x, y and unwrapped yaw of the ego in the order of stamps, shape (n, 4); None for fewer than two."""
+    """Return seconds, x, y and unwrapped yaw of the ego in the order of stamps, shape (n, 4); None for fewer than
+    two.
+    """
     ego = ego[np.isfinite(ego).all(axis=1)]
     _, first = np.unique(ego[:, 0], return_index=True)
     ego = ego[first]

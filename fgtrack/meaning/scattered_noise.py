@@ -107,7 +107,7 @@ def _components(points: Points) -> dict[str, Errors]:
 def _scatter(
     stamps_s: FloatArray, rows: list[IntArray], errors_of: Errors
 ) -> Scatter | None:
-    """Return the noise of a component; None with few triples. `rows` are the triples of each lag."""
+    """Return the noise of a component; None for too few triples. `rows` holds triples of detections, by lag."""
     errors, ranges_m = errors_of(rows[0])
     if len(errors) < _FEWEST:
         return None

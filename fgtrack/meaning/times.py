@@ -149,7 +149,7 @@ def time_columns(
 def _joined(
     columns: Mapping[str, FloatArray], words: Mapping[str, Sequence[str]]
 ) -> dict[tuple[str, ...], FloatArray]:
-    """Times in s by their columns: one column, or seconds and nanoseconds."""
+    """Return the times in s by their columns: one column, or seconds and nanoseconds."""
     result: dict[tuple[str, ...], FloatArray] = {}
     taken = set[str]()
     for name in columns:
@@ -171,7 +171,7 @@ def _joined(
 
 
 def _rank(words: Sequence[str]) -> int:
-    """Number of words of a receipt minus number of words of a stamp."""
+    """Return the number of words of a receipt minus the number of words of a stamp."""
     own = set(words)
     return len(own & _OF_RECEIPT) - len(own & _OF_STAMP)
 

@@ -227,7 +227,7 @@ def _points(
 
 
 def _position(item: Detection) -> tuple[float, float] | None:
-    """Position of a detection in its frame; None without a finite position."""
+    """Return the position of a detection in its frame; None without a finite position."""
     if item.x_m is not None and item.y_m is not None:
         at_m = item.x_m, item.y_m
     elif item.range_m is not None and item.bearing_rad is not None:
@@ -269,7 +269,7 @@ def sights_m(points: Points) -> FloatArray:
 
 
 def _chains(points: Points, noise: Noise) -> IntArray:
-    """Return the tracklet of each detection, shape (n,); -1 for none."""
+    """Return the number of the tracklet of each detection, shape (n,); -1 for a detection without a tracklet."""
     at_m = points.turned_m
     count = len(at_m)
     R = noise.covariances(sights_m(points))

@@ -121,7 +121,7 @@ def _pair(item: Detection) -> tuple[float | None, float | None]:
 
 
 def _unit(raw: FieldPath) -> str | None:
-    """Unit of speed whose conversion is the scale of a field.
+    """Return the unit of speed whose conversion to m/s is the scale of the field.
 
     None for a field without a scale, and for a scale that belongs to no unit.
     """

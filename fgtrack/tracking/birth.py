@@ -25,7 +25,7 @@ from fgtrack.tracking.preprocess import Candidate
 
 @settings
 class Birth:
-    """First state of a track: values and standard deviations of all that its first detection does not measure."""
+    """Assumption on the first state of a track: value and standard deviation of each component that is not measured."""
 
     kind: Literal["measured", "fixed"] = "measured"
     """`measured`: a measured component starts with its own standard deviation, the others with the one assumed;

@@ -231,7 +231,7 @@ def _reading(
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
-    """Return the covariances R (m, k, k), turned by `yaws_rad` (m,): blocks of the position, and its correlations."""
+    """Return the covariances R (m, k, k) after the first two components, the positions, are turned by `yaws_rad`."""
     turns = np.zeros(R.shape)
     diagonal = np.arange(R.shape[-1])
     turns[:, diagonal, diagonal] = 1.0

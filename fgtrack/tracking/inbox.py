@@ -138,11 +138,11 @@ class FusedRecords:
 def is_usable(
     detection: Detection, sensor: SensorModel, at_origin: bool = False
 ) -> bool:
-    """True if `detection` has valid values and a measured one, and is not an empty slot (x = y = 0).
+    """True if all values of `detection` are valid, the sensor measured one, and it is no empty slot (x = y = 0).
 
-    A sensor that measures positions or bearings must give either. Another sensor, as of range rates alone, must give
-    some value: the association finds its object.
-    With `at_origin` there are no empty slots: the first position of many recordings is the origin of the map.
+    A sensor of positions or bearings must give a position or a bearing. A sensor of range rates alone must give a
+    value; the association finds the object. With `at_origin` there are no empty slots: the first position of many
+    recordings is the origin of the map.
     """
     for name in sensor.std:
         value = getattr(detection, name)
@@ -404,7 +404,7 @@ class Inbox(Stateful):
         """Return the pending batches that are ready, oldest stamp first, and the batches that stay pending.
 
         `waits` returns True for a batch that waits at the tick `now_ns`. If a batch waits, all batches of its message
-        stay, because a message misses tracks as a whole. Later batches of the same sensor stay as well.
+        stay, because the misses of tracks are counted once for a message. Later batches of the sensor stay, too.
         """
         pending, held, first_ns = (
             sorted(self.pending, key=attrgetter("stamp_ns")),

@@ -76,7 +76,7 @@ class Candidate(NamedTuple):
 
 
 class StampError(NamedTuple):
-    """The error of a stamp in the innovation: an object has moved by its velocity times the error."""
+    """Part of the innovation that an error of the stamp causes: the velocity of the object times the error."""
 
     motion: MotionModel
     std_s: float
@@ -224,7 +224,7 @@ class Candidates(Lazy[Candidate]):
         ]
 
     def described(self, batch: Batch, position: int) -> list[Detection]:
-        """Return the detections of `batch` that describe the object of a candidate."""
+        """Return the detections of `batch` that were merged into the candidate at `position`."""
         leader, objects = self.leaders[position], batch.message.objects
         return [objects[index] for index in (leader, *self.merged.get(leader, ()))]
 
@@ -558,9 +558,11 @@ def _without(
 def _components(
     code: int, map_yaw_is_assumed: bool
 ) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
-    """Return names and columns of the measured `COMPONENTS`, names that are assumed, and columns with -1 for these.
+    """Return the names of the measured components, their columns, the names that are assumed, and the columns again.
 
-    `code` is the number that the kernel `described` returns.
+    Columns are indices in `COMPONENTS`. In the second columns an assumed component has -1. An assumed component
+    comes from the map: the curvature, and the yaw if `map_yaw_is_assumed`. `code` is the number that the kernel
+    `described` returns.
     """
     columns = np.array([k for k in range(len(COMPONENTS)) if code >> k & 1])
     names = tuple(COMPONENTS[k] for k in columns)

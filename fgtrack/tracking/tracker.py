@@ -120,7 +120,9 @@ class MultiObjectTracker:
 
     @property
     def yaws(self) -> Mapping[str, Mapping[str, int]]:
-        """By sensor: numbers of `yaws` of matched detections, and of the `flipped` and `unused` ones, see `Facing`."""
+        """Numbers of matched detections by sensor: with a yaw (`yaws`), with a yaw that was turned by half a turn
+        (`flipped`), and with a yaw that was not used (`unused`); see `Facing`.
+        """
         return {} if self._parts.facing is None else self._parts.facing.counts
 
     def checkpoint(self) -> TrackerState:

@@ -178,7 +178,7 @@ def _recognises(path: Path) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """Files at `path` with ASTERIX records, sorted by name."""
+    """Return the files at `path` with ASTERIX records, sorted by name."""
     if not path.is_dir():
         return [path]
     usual = [each for each in path.iterdir() if each.suffix in (_ENDING, *_ENDINGS)]
@@ -415,7 +415,7 @@ class _Site:
             self._turn_rad = math.atan2(x_m - self._x_m, y_m - self._y_m)
 
     def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Position in the plane, `x_m` to the east and `y_m` to the north of the station."""
+        """Return the position in the plane, `x_m` to the east and `y_m` to the north of the station."""
         self.misplaces = not self._given
         c = math.cos(self._turn_rad)
         s = math.sin(self._turn_rad)
@@ -425,7 +425,7 @@ class _Site:
 def _detection(
     record: Record, number: int, category: _Category, site: _Site, plane: LocalPlane
 ) -> Detection | None:
-    """Object of a target report; None if the report has no position."""
+    """Return the object of a target report; None if the report has no position."""
     position = next(
         (
             at
@@ -483,7 +483,7 @@ def _velocity(
 
 
 def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
-    """Covariance of the measured components from the accuracy categories; None if the record has no position
+    """Return the covariance of the measured components from the accuracy categories; None if the record has no position
     accuracy.
     """
     radius_m = _NACP_M.get(int(record.get("090/NACP", 0)))

@@ -50,9 +50,9 @@ class RecordReader:
     def __init__(
         self, edition: _Spec, names: Iterable[str], lsb: Mapping[str, float]
     ) -> None:
-        """Prepare the reader for the numbers `names`, as item or item/part; unknown names are ignored.
+        """Prepare the reader for the numbers `names`, each given as item or item/part; unknown names are ignored.
 
-        `lsb` replaces the library's least significant bit of some numbers.
+        `lsb` holds values of the least significant bit that replace the values of the library.
         """
         items = [
             getattr(each, "cv_non_spare", None)
@@ -187,7 +187,7 @@ def _end(variation: _Spec) -> _End:
 
 
 def _extended_end(sizes: Iterable[int], block: bytes, at: int) -> int:
-    """First byte behind parts of the given `sizes`; the last bit of each part announces the next part."""
+    """Return the first byte behind parts of the given `sizes`; the last bit of each part announces the next part."""
     for size in sizes:
         at += size
         if not block[at - 1] & 1:

@@ -102,7 +102,9 @@ def split(
 
 
 def object_id(value: object) -> int | None:
-    """Integer id for `value`: the integer itself, a stable hash below 2^48 for another text, None for an empty text."""
+    """Return an integer id for `value`: itself if it is an integer, None for an empty text, a hash below 2^48 for
+    another text.
+    """
     text = str(value).strip()
     if (
         text.removeprefix("-").isdecimal()
@@ -118,7 +120,7 @@ def object_id(value: object) -> int | None:
 
 
 def identity(value: object) -> str | None:
-    """The identity `value` in a uniform spelling (0x4ca911 becomes 4CA911); None if it is empty."""
+    """Return the identity `value` in a uniform spelling (0x4ca911 becomes 4CA911); None if it is empty."""
     return str(value).strip().upper().removeprefix("0X") or None
 
 
@@ -139,19 +141,21 @@ def stamp_ns(time: RosMessage) -> int:
 
 
 def frame_of(header: RosMessage) -> Frame:
-    """Frame of a header: `map` for the usual names of a fixed frame (`MAP_FRAMES`), else `ego`."""
+    """Return the frame of a header: `map` for the usual names of a fixed frame (`MAP_FRAMES`), else `ego`."""
     return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
 
 
 def object_list(
     header: RosMessage, objects: Iterable[Detection], frame: Frame | None = None
 ) -> ObjectList:
-    """Object list with the stamp of `header`, and with the header's frame if `frame` is None."""
+    """Return an object list with the stamp of `header`, and with the header's frame if `frame` is None."""
     return ObjectList(stamp_ns(header.stamp), frame or frame_of(header), tuple(objects))
 
 
 def yaw_rad(orientation: RosMessage) -> float | None:
-    """Yaw of a quaternion of any norm; None for the quaternion 0, which means that the orientation is unknown."""
+    """Return the yaw of a quaternion of any norm; None for the quaternion 0, which means that the orientation is
+    unknown.
+    """
     x = orientation.x
     y = orientation.y
     z = orientation.z
@@ -175,7 +179,7 @@ def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) ->
 
 @np.errstate(all="ignore")  # the tracker counts values that are not finite
 def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
-    """Gradient, shape (2,), of the speed by the velocity; (1, 0) at velocity 0."""
+    """Return the gradient, shape (2,), of the speed by the velocity; (1, 0) at velocity 0."""
     speed = math.hypot(vx_mps, vy_mps)
     return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
 
@@ -187,7 +191,7 @@ def covariance(
     twist: FloatArray | None = None,
     velocity: Any = None,
 ) -> tuple[float, ...] | None:
-    """Row-major covariance of the measured components, in the order of `MEASURABLE`.
+    """Return the row-major covariance of the measured components, in the order of `MEASURABLE`.
 
     `values` are the measured position, yaw and speed; a component that is None is not measured. `pose` is the
     covariance of x, y and yaw, shape (3, 3). `twist` begins with the covariance of `velocity`; the variance of the
@@ -212,5 +216,5 @@ def covariance(
 
 
 def planar(covariance36: Sequence[float]) -> FloatArray:
-    """Covariance of x, y and the rotation about z, shape (3, 3), from the 36 values of a ROS covariance."""
+    """Return the covariance of x, y and the rotation about z, shape (3, 3), from the 36 values of a ROS covariance."""
     return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]

@@ -102,7 +102,7 @@ def _along_sight(
 
 
 def paths_of(path: FieldPath) -> list[str]:
-    """Paths of the recorded fields of a component."""
+    """Return the paths of the recorded fields of a component."""
     path = path.path if isinstance(path, Field) else path
     return [path] if isinstance(path, str) else list(path)
 
@@ -164,7 +164,7 @@ def _float(value: Any, path: str) -> float | None:
 
 
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
-    """Yaw of a quaternion of any norm; NaN for the quaternion 0."""
+    """Return the yaw of a quaternion of any norm; NaN for the quaternion 0."""
     yaw = yaw_rad(SimpleNamespace(x=x, y=y, z=z, w=w))
     return math.nan if yaw is None else yaw
 
@@ -228,7 +228,7 @@ def ego_by_fields(
     receipt_ns: int,
     plane: LocalPlane | None = None,
 ) -> EgoState:
-    """State of the ego; heading and speed are NaN if `fields` does not contain them."""
+    """Return the state of the ego; heading and speed are NaN if `fields` does not contain them."""
     stamp = _message_stamp(message, fields)
     plane = plane or LocalPlane()
     values = plane.in_plane(
@@ -271,7 +271,7 @@ def _time(message: RosMessage, path: FieldPath) -> int:
 
 
 def fields_of(message: RosMessage) -> dict[str, Any]:
-    """Values of the fields of `message`, by path.
+    """Return the values of the fields of `message`, by path.
 
     Numbers, texts, yaws of quaternions, times in s, and lists of objects.
     """

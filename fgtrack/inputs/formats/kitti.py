@@ -179,7 +179,7 @@ def view_of_sequence(path: Path) -> list[View]:
 def _folder_and_sequence(
     path: Path, named: int | str | None = None
 ) -> tuple[Path, str]:
-    """Folder and name of a sequence.
+    """Return folder and name of a sequence.
 
     `path` is the folder, or a file of `oxts/`; `named` is the number or name of the sequence in a folder with several.
 
@@ -278,7 +278,7 @@ def _region(
 def _detection(
     settings: KittiInput, sensor: str, view: View, fields: list[str]
 ) -> Detection | str:
-    """Detection of a line, or the setting that excludes it. Raises `ValueError` for a malformed line."""
+    """Return the detection of a line, or the setting that excludes it. Raises `ValueError` for a malformed line."""
     if len(fields) not in _FORMS:
         raise ValueError(
             f"it has {len(fields)} fields instead of 6 (a box in the image), 15 (AB3DMOT), 17 or 18 (KITTI)"

@@ -82,7 +82,7 @@ class View(NamedTuple):
     """Dead-reckoned position of the ego, without the steps of the reported positions; labels are relative to it."""
 
     def position_m(self, rectified_m: list[float]) -> FloatArray:
-        """Position in the ego frame, shape (3,), of a point in the rectified camera frame."""
+        """Return the position in the ego frame, shape (3,), of a point in the rectified camera frame."""
         return (
             self.levelled_from_imu
             @ np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3]
@@ -101,7 +101,7 @@ class View(NamedTuple):
     def rectified(
         self, position_m: FloatArray, yaw_rad: float
     ) -> tuple[FloatArray, float]:
-        """Position (3,) and rotation about y in the rectified camera frame: the inverse of `pose`."""
+        """Return position (3,) and rotation about y in the rectified camera frame: the inverse of `pose`."""
         turn = self.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
         heading = turn @ [math.cos(yaw_rad), math.sin(yaw_rad), 0.0]
         return turn @ position_m + self.rectified_from_imu[:3, 3], math.atan2(
@@ -109,13 +109,13 @@ class View(NamedTuple):
         )
 
     def bearing_rad(self, u_px: float, v_px: float) -> float:
-        """Bearing of an image point from camera 2; 0 along the ego's heading."""
+        """Return the bearing of an image point from camera 2; 0 along the ego's heading."""
         return self._azimuth_rad(
             np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist()
         )
 
     def in_map(self, position_m: FloatArray) -> FloatArray:
-        """Positions in the map, shape (..., 2), of points in the ego frame."""
+        """Return the positions in the map, shape (..., 2), of points in the ego frame."""
         return (
             np.array(self.estimate.position_m)
             + position_m[..., :2] @ rotation(self.ego.yaw_rad).T
@@ -223,6 +223,6 @@ def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | Non
 
 
 def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:
-    """Position to the east and north, shape (2,), true to scale at the latitude with the cosine `scale`."""
+    """Return the position to the east and north, shape (2,), true to scale at the latitude with the cosine `scale`."""
     north = math.log(math.tan(math.radians(45.0 + 0.5 * latitude_deg)))
     return scale * _EARTH_RADIUS_M * np.array([math.radians(longitude_deg), north])

@@ -29,7 +29,7 @@ TEXTS = frozenset({"class_name", "id"})
 
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
-    """Values of the optional fields whose bits are set in `present`."""
+    """Return the values of the optional fields whose bits are set in `present`."""
     names = _optional(message.__class__)
     given = {
         name: getattr(message, name)
@@ -44,13 +44,13 @@ def _given(message: RosMessage) -> dict[str, RosMessage]:
 
 @cache
 def _optional(kind: RosMessage) -> tuple[str, ...]:
-    """Names of the fields after `present`, in the order of the recording's definition."""
+    """Return the names of the fields after `present`, in the order of the recording's definition."""
     names = [field.name for field in fields(kind)]
     return tuple(names[names.index("present") + 1 :])
 
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
-    """State of the ego from a `fgtrack_msgs/Ego`."""
+    """Return the state of the ego from a `fgtrack_msgs/Ego`."""
     # Recordings of fgtrack 0.1.0 have no covariance.
     covariance: RosMessage = getattr(message, "covariance", ())
     return EgoState(
@@ -63,7 +63,7 @@ def ego(message: RosMessage, receipt_ns: int) -> EgoState:
 
 
 def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
-    """Object list from a `fgtrack_msgs/DetectionList`."""
+    """Return the object list from a `fgtrack_msgs/DetectionList`."""
     objects = tuple(Detection(**_given(item)) for item in message.objects)
     stamp = stamp_ns(message.header.stamp)
     # Recordings of fgtrack 0.3.0 have no origin.

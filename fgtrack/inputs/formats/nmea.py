@@ -156,7 +156,9 @@ def _list(
 def _detection(
     report: Any, plane: LocalPlane
 ) -> Detection | None:  # Any: pyais has a class for each message type
-    """Detection of the ship in a report; None if the report has no position. A slow ship's course is left out."""
+    """Return the detection of the ship in a report; None if the report has no position. A slow ship's course is
+    left out.
+    """
     if report.msg_type not in _POSITIONS:
         return None
     x_m, y_m = plane.position_m(report.lat, report.lon)

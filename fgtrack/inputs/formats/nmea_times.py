@@ -61,7 +61,7 @@ def is_damaged(sentence: bytes) -> bool:
 
 
 def wrapped_time_s(sentence: bytes) -> float | None:
-    """Time of a Gatehouse sentence ($PGHP), which belongs to the next sentence; None for other sentences."""
+    """Return the time of a Gatehouse sentence ($PGHP), which belongs to the next sentence; None for other sentences."""
     if not sentence.startswith(_WRAPPER):
         return None
     fields = sentence.partition(b"*")[0].decode("ascii", "replace").split(",")
@@ -72,7 +72,7 @@ def wrapped_time_s(sentence: bytes) -> float | None:
 
 
 def _tag_time_s(tags: bytes) -> float | None:
-    """Time in the tag blocks `tags`; None without a time, or if its checksum is wrong."""
+    """Return the time in the tag blocks `tags`; None without a time, or if its checksum is wrong."""
     for block in filter(None, tags.split(b"\\")):
         content, mark, _ = block.partition(b"*")
         found = _TAG_TIME.search(content)

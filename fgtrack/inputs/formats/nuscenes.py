@@ -86,7 +86,7 @@ def _results(file: Path) -> Iterator[tuple[str, Json]]:
 
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
-    """Folder of the tables; the results file, or the link to it, may be anywhere. Raises `CallError`."""
+    """Return the folder of the tables; the results file, or the link to it, may be anywhere. Raises `CallError`."""
     beside = [file.parent, file.resolve().parent]
     given = settings.tables
     if given is not None:
@@ -103,7 +103,7 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
 
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
-    """Stamps of the scene's samples, by token, in the order of time.
+    """Return the stamps of the scene's samples, by token, in the order of time.
 
     Raises `CallError` unless exactly one scene is meant.
     """
@@ -132,7 +132,7 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
 
 
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
-    """States of the ego at the samples' sensor data, with speed and yaw rate from successive poses."""
+    """Return the states of the ego at the samples' sensor data, with speed and yaw rate from successive poses."""
     wanted = {
         each["ego_pose_token"]
         for each in json_values(tables / "sample_data.json")
@@ -159,7 +159,7 @@ def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
 def _motion(
     first: tuple[float, ...], second: tuple[float, ...], after_s: float
 ) -> tuple[float, float]:
-    """Speed along the yaw, and yaw rate, between two poses (x, y, yaw)."""
+    """Return speed along the yaw, and yaw rate, between two poses (x, y, yaw)."""
     turn_rad = wrap_angle(second[2] - first[2])
     middle_rad = first[2] + 0.5 * turn_rad
     vx_mps = (second[0] - first[0]) / after_s

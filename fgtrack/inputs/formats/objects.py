@@ -43,7 +43,7 @@ _UNKNOWN = 1e3
 
 
 def detection3d_array(message: RosMessage) -> ObjectList:
-    """Object list of a `vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
+    """Return the object list of a `vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
 
     The pose is the box's; it is the first hypothesis's if the box has no size. The
     covariance is the first hypothesis's.
@@ -81,7 +81,7 @@ def _detection3d(item: RosMessage) -> Detection:
 
 
 def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
-    """Height `z_m` of the centre; length, width and height of a box with a length."""
+    """Return the height `z_m` of the centre, and length, width and height of a box with a length."""
     centre = {"z_m": z_m}
     if size.x > 0.0:
         centre |= {"length_m": size.x, "width_m": size.y, "height_m": size.z}
@@ -89,7 +89,7 @@ def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
 
 
 def autoware_objects(message: RosMessage) -> ObjectList:
-    """Object list of Autoware's detected, tracked or predicted objects, in either message package.
+    """Return the object list of Autoware's detected, tracked or predicted objects, in either message package.
 
     Position; yaw if its sign is certain; speed if there is a twist, which is in the
     object's own frame.
@@ -98,7 +98,7 @@ def autoware_objects(message: RosMessage) -> ObjectList:
 
 
 def _autoware_object(item: RosMessage) -> Detection:
-    """Detection from a detected object, which may lack twist and covariances, or from an object with an id.
+    """Return the detection of an object, which may lack an id, a twist or covariances.
 
     A predicted object has an initial pose and twist, and always an orientation.
     """
@@ -150,7 +150,7 @@ def _autoware_object(item: RosMessage) -> Detection:
 
 
 def delphi_esr(message: RosMessage) -> ObjectList:
-    """Object list of a `delphi_esr_msgs/EsrTrack`: one track of a Delphi (Aptiv) ESR.
+    """Return the object list of a `delphi_esr_msgs/EsrTrack`: one track of a Delphi (Aptiv) ESR.
 
     Its angles are in degrees, clockwise.
     """
@@ -168,7 +168,7 @@ def delphi_esr(message: RosMessage) -> ObjectList:
 
 
 def radar_tracks(message: RosMessage) -> ObjectList:
-    """Object list of a `radar_msgs/RadarTracks`: position and speed; there is no heading."""
+    """Return the object list of a `radar_msgs/RadarTracks`: position and speed; there is no heading."""
     return object_list(message.header, map(_radar_track, message.tracks))
 
 
@@ -198,12 +198,12 @@ def _uuid(identity: RosMessage) -> int | None:
 
 
 def _planar_triangle(triangle: RosMessage) -> np.ndarray:
-    """Covariance of x and y, shape (2, 2), from the upper triangle xx, xy, xz, yy, yz, zz."""
+    """Return the covariance of x and y, shape (2, 2), from the upper triangle xx, xy, xz, yy, yz, zz."""
     return np.asarray(triangle, dtype=np.float64)[[0, 1, 1, 3]].reshape(2, 2)
 
 
 def pose_array(message: RosMessage) -> ObjectList:
-    """Object list of a `geometry_msgs/PoseArray`: position and yaw."""
+    """Return the object list of a `geometry_msgs/PoseArray`: position and yaw."""
     objects = [
         Detection(
             each.position.x,
@@ -217,7 +217,7 @@ def pose_array(message: RosMessage) -> ObjectList:
 
 
 def odometry(message: RosMessage) -> ObjectList:
-    """Object list of the `nav_msgs/Odometry` of one object: position, yaw and speed.
+    """Return the object list of the `nav_msgs/Odometry` of one object: position, yaw and speed.
 
     The twist is in the object's own frame.
     """
@@ -239,7 +239,7 @@ def odometry(message: RosMessage) -> ObjectList:
 
 
 def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
-    """State of the ego from a `nav_msgs/Odometry`: pose in the map, twist in the ego's own frame.
+    """Return the state of the ego from a `nav_msgs/Odometry`: pose in the map, twist in the ego's own frame.
 
     An unknown yaw is NaN.
     """
@@ -260,7 +260,8 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
 
 @np.errstate(all="ignore")  # a block that is not finite counts as unknown
 def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
-    """Row-major covariance of x, y, yaw, speed and yaw rate; None if the pose's and the twist's blocks are unknown.
+    """Return the row-major covariance of x, y, yaw, speed and yaw rate; None if the pose's and the twist's blocks
+    are unknown.
 
     An unknown block is 0.
     """

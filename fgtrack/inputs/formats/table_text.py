@@ -189,7 +189,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _names_of(rows: Sequence[Sequence[str]], where: str) -> tuple[str, ...]:
-    """Names of the columns of a known layout without a header; raises `DataError` for another table."""
+    """Return the names of the columns of a known layout without a header. Raises `DataError` for another table."""
     if all(len(row) == len(_SBS) and row[0] in _SBS_KINDS for row in rows):
         return _SBS
     is_numeric = all(

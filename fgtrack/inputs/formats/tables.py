@@ -270,7 +270,7 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]
 
 
 def _unpacked(raw: BinaryIO) -> BinaryIO:
-    """The file `raw`, decompressed if it is gzipped."""
+    """Return the file `raw`, or a file with its decompressed content if `raw` is gzipped."""
     is_packed = raw.read(2) == GZIP_MAGIC
     raw.seek(0)
     return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw

@@ -140,7 +140,7 @@ class Bag:
             yield files
 
     def _break_off(self, files: list[BagFile]) -> str | None:
-        """Reason why the recording breaks off: the first file that is truncated or empty."""
+        """Return the reason why the recording breaks off: the first file that is truncated or empty."""
         broken = [f"{file.path} {file.break_off}" for file in files if file.break_off]
         empty = [f"{path} is empty" for path in self._paths if path.stat().st_size == 0]
         return next(iter(broken + empty), None)

@@ -108,7 +108,9 @@ def ego_states(
 
 @np.errstate(all="ignore")  # a block that is not finite counts as unknown
 def _covariance(message: RosMessage) -> tuple[float, ...] | None:
-    """Row-major covariance of x, y, yaw, speed and yaw rate from a message with a pose and its covariance."""
+    """Return the row-major covariance of x, y, yaw, speed and yaw rate from a message with a pose and its
+    covariance.
+    """
     given = getattr(getattr(message, "pose", None), "covariance", None)
     if given is None or not is_known_covariance(pose := planar(given)):
         return None

@@ -327,7 +327,7 @@ def named(frame_id: str) -> str:
 
 
 def _last(frame: str) -> str:
-    """Last name of a frame with a namespace: `map` of `car1/map`."""
+    """Return the last name of a frame with a namespace: `map` of `car1/map`."""
     return frame.rsplit("/", 1)[-1].lower()
 
 

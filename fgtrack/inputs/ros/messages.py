@@ -215,7 +215,9 @@ def _optional(
 
 
 def _full_covariance(item: Detection) -> FloatArray | None:
-    """Covariance of the pose, shape (6, 6); None if the detection has no covariance, or one of a wrong size."""
+    """Return the covariance of the pose, shape (6, 6); None if the detection has no covariance, or one of a wrong
+    size.
+    """
     size = len(item.measured)
     if item.covariance is None or len(item.covariance) != size**2:
         return None

@@ -267,9 +267,10 @@ def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
 
 
 def _without_remarks(text: str) -> str:
-    """Return the IDL text without remarks; raises `ValueError` for text that rosbags would parse for minutes.
+    """Return the IDL text without comments.
 
-    This text computes constants, or nests sequences deeply.
+    Raises `ValueError` for a text that computes constants or nests sequences deeply: rosbags would parse it for
+    minutes.
     """
     plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
     if _IDL_COSTLY.search(plain):
@@ -318,7 +319,7 @@ def _check_type_name(name: str) -> None:
 
 
 def _innermost(description: FieldDesc) -> FieldDesc:
-    """Type of the elements of nested arrays and sequences. Raises `ValueError` for too long an array."""
+    """Return the type of the elements of nested arrays and sequences. Raises `ValueError` for too long an array."""
     while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         description, size = cast("tuple[FieldDesc, int]", description[1])
         if not 0 <= int(size) <= _LONGEST_ARRAY:

@@ -42,7 +42,7 @@ _PRIOR_M = 20.0
 
 
 class YawRange(NamedTuple):
-    """Yaw with its largest error."""
+    """Yaw in rad, and the largest error that it may have."""
 
     yaw_rad: float
     error_rad: float

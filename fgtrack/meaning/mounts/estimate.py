@@ -121,14 +121,14 @@ class MountEstimate:
 
 
 def t_quantile(dof: FloatArray, share: float) -> FloatArray:
-    """Quantile of Student's t distribution; few degrees of freedom count as `FEWEST_DOF`."""
+    """Return the quantile of Student's t distribution; few degrees of freedom count as `FEWEST_DOF`."""
     from scipy.special import stdtrit  # the import takes a tenth of a second
 
     return np.asarray(stdtrit(np.maximum(dof, FEWEST_DOF), share))
 
 
 def _within(value: float, half: float, unit: str) -> str:
-    """A value with its 95 % interval in words."""
+    """Return a value with its 95 % interval in words."""
     if not math.isfinite(half):
         return f"{value:.2f} {unit} (assumed)"
     return f"{value:.2f} +- {half:.2f} {unit}"
@@ -164,7 +164,7 @@ class Mounts:
 
 
 def is_significant(d: FloatArray, stds: FloatArray, dof: FloatArray) -> BoolArray:
-    """Mask of the components of a mount that differ from 0 significantly, and enough to matter."""
+    """Return True for each component of a mount that differs from 0 significantly, and enough to matter."""
     known = np.isfinite(stds) & (dof >= FEWEST_DOF)
     factor = t_quantile(dof, 1.0 - SURE)
     limit = np.where(known, stds, np.inf) * factor

@@ -112,7 +112,9 @@ def solved(table: Table, poses: Sequence[Pose2], root: Pose2, free: Free) -> Sol
 
 
 def _absolute(poses: Sequence[Pose2], root: Pose2, size: int) -> FloatArray:
-    """Jacobian of the mounts in the ego and of the errors along the sight by the parameters, shape (size, size)."""
+    """Return the Jacobian of the mounts in the ego and of the errors along the sight by the parameters, shape
+    (size, size).
+    """
     L = np.eye(size)
     turn = rotation(root.yaw_rad)
     for k, pose in enumerate(poses[1:], 1):
@@ -202,7 +204,7 @@ def sight_errors(table: Table, poses: Sequence[Pose2], root: Pose2) -> tuple[int
 
 
 def still_mask(table: Table, velocities_mps: FloatArray) -> BoolArray:
-    """Mask of the detections in runs of objects that stand still."""
+    """Return True for each detection in a run of an object that stands still."""
     starts = np.flatnonzero(np.diff(table.runs, prepend=-1))
     ends = np.append(starts[1:], len(table.runs)) - 1
     lengths_s = table.times_s[ends] - table.times_s[starts]

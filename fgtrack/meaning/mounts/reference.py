@@ -35,7 +35,7 @@ _MODEL_DOF = 100.0
 
 @dataclass(frozen=True)
 class Reference:
-    """Evidence for the mount of the reference."""
+    """Evidence on the mount of the reference sensor, in the ego."""
 
     why: str
     """A line on the evidence."""

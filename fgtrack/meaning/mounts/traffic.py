@@ -235,7 +235,7 @@ def _shares(
 
 
 def _normal(x: FloatArray, variance: FloatArray | float) -> FloatArray:
-    """Density of the normal distribution with mean 0."""
+    """Return the density of the normal distribution with mean 0."""
     return np.asarray(
         np.exp(-0.5 * np.square(x) / variance) / np.sqrt(2.0 * math.pi * variance)
     )

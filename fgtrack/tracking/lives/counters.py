@@ -99,10 +99,11 @@ class LifecycleRules:
 
 
 class CountingLifecycle(Stateful):
-    """Counts matches and misses: status of tracks, and which of them end.
-    A track is aged by every sensor at the range it is responsible for, and by time alone as well. Only sensors that
-    give positions count: a bearing fits whatever is behind or before its object as well, so it neither starts nor
-    confirms nor keeps a track.
+    """Decides by counts of matches and misses which tracks are confirmed, and which tracks end.
+
+    Each sensor that could show a track and does not, ages the track. So does time alone. Only sensors of positions
+    count. A bearing also fits objects behind and before its own object, so it neither starts nor confirms nor keeps
+    a track.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (

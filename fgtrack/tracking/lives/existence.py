@@ -313,7 +313,7 @@ class ExistenceLifecycle(Stateful):
     def likely(
         self, name: str, stamp_ns: int, track_ids: Sequence[int], pairs: Pairs
     ) -> BoolArray:
-        """Return True for each of `pairs` that is likelier a track than clutter or a new object, shape (m,).
+        """Return True for each pair whose position is likelier from the track than from clutter or a new object, (m,).
 
         The pairs are pairs of positions of a list and tracks. The test is P_D r N(y; 0, S) > (1 - P_D r) clutter / (1 -
         birth probability), for each pair by itself. Sensors without `scan` have 1 instead of 1 - P_D r.
@@ -509,7 +509,7 @@ def position_densities(
 
 
 def position_covariances(candidates: Candidates, chosen: IntArray) -> FloatArray:
-    """Covariances of the positions of `chosen` (m,), shape (m, 2, 2)."""
+    """Return the covariances of the positions of the candidates `chosen` (m,), shape (m, 2, 2)."""
     R = np.empty((len(chosen), 2, 2))
     for group, members, here in candidates.split(chosen):
         R[here] = group.position_covariances(members)
@@ -517,7 +517,9 @@ def position_covariances(candidates: Candidates, chosen: IntArray) -> FloatArray
 
 
 def densities(y_m: FloatArray, P: FloatArray, R: FloatArray) -> FloatArray:
-    """N(y; 0, P + R) of innovations of positions (m, 2) with both covariances (m, 2, 2), in 1/m^2; NaN if singular."""
+    """Return N(y; 0, P + R) of innovations of positions (m, 2) with both covariances (m, 2, 2), in 1/m^2; NaN if
+    singular.
+    """
     own, H, every = (
         np.array(P, dtype=np.float64, order="C"),
         np.eye(2)[None],

@@ -27,7 +27,7 @@ _KERNELS = "fgtrack.tracking.lives.visibility_kernels"
 
 
 class Histories(Stateful):
-    """Evidence of all tracks by stamp, and the probabilities after each entry; both do not depend on the order of
+    """Evidence of all tracks by stamp, and the probabilities after each entry. Neither depends on the order of
     arrival.
 
     Entry 0 of a track is its birth, or summarises all evidence that is older than the remembered evidence.

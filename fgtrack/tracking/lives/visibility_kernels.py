@@ -21,7 +21,7 @@ from fgtrack.tracking.lives.visibility import (
 
 @inlined
 def _survived(log_odds: float, dt_ns: int, lifetime_s: float) -> float:
-    """Log-odds after `dt_ns`: odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)."""
+    """Return the log-odds after `dt_ns`: odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)."""
     dt = dt_ns / (NS_PER_S * lifetime_s)
     if dt <= 0.0:
         return log_odds
