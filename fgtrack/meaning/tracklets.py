@@ -373,6 +373,8 @@ def speeds_mps(points: Points, yaw_rad: float = 0.0) -> FloatArray:
     `yaw_rad` is the yaw of the sensor on the ego. The lever arm has no influence on
     straight roads, and a small influence in turns.
     """
+    if len(points.points_m) < _SHORTEST:
+        return np.zeros(0)
     chains, _ = tracklets(points)
     rows = triples(points, chains, _SPEED_LAG)[:, [0, 2]]
     elapsed_s = np.diff(points.stamps_s[rows], axis=1)
