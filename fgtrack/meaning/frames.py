@@ -157,7 +157,10 @@ def _mean(
 
 
 def _least_turned(table: FloatArray) -> FloatArray:
-    """Return the deviations in the map of positions in the frame of a sensor, for the best yaw of the sensor."""
+    """Return deviations of positions in the map, shape (n, 2), if the frame of the positions is a sensor's.
+
+    The yaw of the sensor is 0, or the yaw with the smallest deviations.
+    """
     turned = table[:, 2] + 1j * table[:, 3]
     ego = table[:, 4] + 1j * table[:, 5]
     usual = np.median(np.abs(turned)) + np.median(np.abs(ego)) + 1e-9

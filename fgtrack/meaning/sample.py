@@ -58,7 +58,7 @@ Test = Callable[[Sample], Iterable[Decision]]
 
 
 def first_messages(path: Path, config: Config) -> list[Message]:
-    """Return the messages of the first `SAMPLE_S` up to a break; empty if the recording cannot be read."""
+    """Return the messages of the first `SAMPLE_S`, until the recording breaks off; empty if it cannot be read."""
     result: list[Message] = []
     with suppress(FgtrackError):  # the replay reports it
         source = open_input(path, config.input)

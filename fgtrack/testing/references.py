@@ -116,6 +116,7 @@ def kalman_filter(
     iterated: bool = False,
 ) -> dict[int, TrackState]:
     """States at `stamps_ns` of the extended Kalman filter, which fuses `measurements` in the order of their stamps.
+
     A robust loss weighs a measurement by the part of its innovation that is left after the update. The `iterated`
     filter linearises each measurement at the result of its update. Raises `CallError` for a motion model without an
     equation.
@@ -239,6 +240,7 @@ def difference(
     found: TrackState, expected: TrackState, motion: MotionModel | None = None
 ) -> tuple[float, float]:
     """Distance of `found` from `expected`: the largest difference of means and covariances, in standard deviations.
+
     A covariance is relative to the two standard deviations of its entry; a NaN stays one. The yaw of a state of
     `motion` goes the short way round.
     """

@@ -234,6 +234,7 @@ def _key(
 
 class Inbox(Stateful):
     """Keeps every message until it is processed. Refuses messages that are repeated, too late or in the future.
+
     Refuses single detections that are invalid, too.
 
     An interrupt loses no detection and counts none twice. One statement assigns all that a message changes, and no

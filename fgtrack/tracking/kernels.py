@@ -302,9 +302,10 @@ def near(
 def linked(
     points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
 ) -> tuple[IntArray, BoolArray]:
-    """Return for each of `points` (n, 2) the first point that it is linked to, shape (n,), and lists without links.
+    """Return for each of `points` (n, 2) the first point that it is linked to, shape (n,), and True for each list
+    without links.
 
-    Points of a list are linked by steps of at most `distance`. The second result is True for each list without links.
+    Points of a list are linked by steps of at most `distance`.
     List k has the points `by_x` (n,) from `starts[k]` up to the next start, in the order of x.
     """
     check(_checked_starts(starts, len(starts) - 1, len(points)) <= len(by_x))

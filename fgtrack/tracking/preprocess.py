@@ -139,7 +139,7 @@ class Group(NamedTuple):
     def seen_at(
         self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
     ) -> Measurement:
-        """Return the stack of measurements of `members`, ascending. The arguments are those of `noise`."""
+        """Return the measurements of `members`, ascending, as one stack. The arguments are those of `noise`."""
         own = self.stack
         if len(members) == len(own.z) and not self.depends_on_state:
             return own
@@ -541,8 +541,9 @@ def _without(
     reason: str,
     lost: Sequence[dict[int, str]],
 ) -> MapDetections:
-    """Return the detections that are not `outside` (m,). The dictionary in `lost` of their batch gets the indices of
-    the other detections, with the `reason`.
+    """Return the detections that are not `outside` (m,).
+
+    `lost` holds a dictionary for each batch, which gets the `reason` by the index of each other detection.
     """
     rows = outside.nonzero()[0]
     if not len(rows):

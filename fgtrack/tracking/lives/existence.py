@@ -118,7 +118,8 @@ class ExistenceRules:
 
 
 class ExistenceLifecycle(Stateful):
-    """Tracks live by the probability that their objects exist; see the module.
+    """Decides by the probability that an object exists which tracks are confirmed, and which tracks end.
+
     A list does not count for objects out of its sensor's range and field of view. Without an ego all are in view.
     """
 

@@ -38,6 +38,7 @@ def _conclude(
     visible_s: float,
 ) -> None:
     """Write the probabilities after entry k of one track.
+
     Prediction v = share + (v - share) exp(-dt / visible_s), likelihood 1 - v + v ratio, update v ratio / likelihood.
     """
     for j in range(VISIBLE, numbers.shape[1]):
