@@ -100,10 +100,8 @@ def _meaning(
     values = (lambda item: (item.speed_mps,)) if len(paths) == 1 else _pair
     sensor = sample.config.sensors.get(name)
     mount = None if sensor is None else sensor.mount
-    known = _with_mapping(sample.config, name, columns)
-    # The velocity is tested though another question about the sensor is open.
     scans = scans_of(
-        sample.read(replace(known, ignore_sensors=())),
+        sample.read(_alone(sample.config, name, columns)),
         name,
         values,
         mount,
@@ -133,16 +131,16 @@ def _unit(raw: FieldPath) -> str | None:
     )
 
 
-def _with_mapping(
-    config: Config, name: str, mapping: Mapping[str, FieldPath]
-) -> Config:
-    """Return `config` with another mapping of the fields or columns of a sensor."""
+def _alone(config: Config, name: str, mapping: Mapping[str, FieldPath]) -> Config:
+    """Return `config` with the ego and one sensor alone, with another mapping of its fields or columns."""
     inputs = config.input
-    topics: dict[str, TopicInput] = dict(inputs.detections)
-    tables: dict[str, CsvTable] = dict(inputs.csv.detections)
-    if name in topics:
-        topics[name] = replace(topics[name], fields=mapping)
+    topics: dict[str, TopicInput] = {}
+    tables: dict[str, CsvTable] = {}
+    if name in inputs.detections:
+        topics[name] = replace(inputs.detections[name], fields=mapping)
     else:
-        tables[name] = replace(tables[name], columns=mapping)
-    csv = replace(inputs.csv, detections=tables)
-    return replace(config, input=replace(inputs, detections=topics, csv=csv))
+        tables[name] = replace(inputs.csv.detections[name], columns=mapping)
+    csv = replace(inputs.csv, detections=tables, truth=None)
+    alone = replace(inputs, detections=topics, csv=csv, truth=None)
+    # The velocity is tested though another question about the sensor is open.
+    return replace(config, input=alone, ignore_sensors=())

@@ -243,6 +243,32 @@ def test_a_tested_setting_is_applied_before_the_next_test_reads(tables, tests):
     assert set(seen) == {"map"}
 
 
+def test_a_table_in_the_frame_of_the_sensor_has_the_messages_of_another_reading(
+    tables, tests
+):
+    """The messages get the frame, and the table is read once."""
+    seen = []
+
+    def reads_the_sensor(sample):
+        key = sample.input_path("radar_front")
+        yield Decision(
+            "radar_front", "frame", {(*key, "frame"): "sensor"}, "tested", "a mount"
+        )
+
+    def looks(sample):
+        seen.extend(sample.messages)
+        again = evidence.first_messages(sample.path, sample.config)
+        assert list(sample.messages) == again
+        return ()
+
+    tests(reads_the_sensor, looks)
+    drafted(tables)
+    frames = {
+        (each.sensor, each.frame) for each in seen if isinstance(each, DetectionList)
+    }
+    assert ("radar_front", "sensor") in frames
+
+
 def test_a_sensor_with_an_open_question_is_left_out_and_asked_again(
     tables, tests, tmp_path
 ):
