@@ -30,7 +30,7 @@ def write_crowd(folder: Path, problem: CrowdProblem) -> Path:
     """
     path = folder / MEASUREMENTS
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_COLUMNS)
         known = 0
         for number_of_query, query in enumerate(problem.queries):
@@ -113,7 +113,7 @@ def _whole(row: Mapping[str, str], name: str, line: int) -> int:
 def write_crowd_truth(folder: Path, problem: CrowdProblem) -> None:
     """Write `truth.csv` into `folder`: the true positions of the objects in view, by query and object."""
     with (folder / "truth.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("query", "object_id", "x_m", "y_m"))
         for number, positions in enumerate(problem.truth):
             for object_id, point_m in sorted(positions.items()):

@@ -49,7 +49,7 @@ def write_problem(folder: Path, problem: Problem) -> Path:
         )
     path = folder / MEASUREMENTS
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _COLUMNS)
+        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     write_states(folder / "prior.csv", [problem.prior])
@@ -146,7 +146,7 @@ def finite_number(text: str | None, name: str, line: int) -> float:
 def write_exact(folder: Path, problem: Problem) -> None:
     """Write `truth.csv` and `exact.csv` into `folder`: a row for each query, as in `states.csv`."""
     with (folder / "truth.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(STATE)
         for query in problem.queries:
             writer.writerow(problem.truth[query.stamp_ns].tolist())
@@ -156,7 +156,7 @@ def write_exact(folder: Path, problem: Problem) -> None:
 def write_states(path: Path, answers: Iterable[Answer]) -> None:
     """Write answers with covariances in the columns of `states.csv`."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow((*STATE, *UPPER))
         for answer in answers:
             assert answer.covariance is not None

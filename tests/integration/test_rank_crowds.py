@@ -194,6 +194,8 @@ def test_the_command_ranks_trackers_and_exports_the_truth(tmp_path: Path) -> Non
     assert "T-GOSPA" in (tmp_path / "out/drop.md").read_text(encoding="utf-8")
     header = (tmp_path / "files/oos-mtt/truth.csv").read_text().splitlines()[0]
     assert header == "query,object_id,x_m,y_m"
+    for path in (tmp_path / "files").rglob("*.csv"):
+        assert b"\r" not in path.read_bytes()  # awk would read it into the last column
 
 
 def test_the_page_lists_every_scenario_of_several_objects() -> None:
