@@ -282,8 +282,13 @@ ANGLES = ("yaw_rad", "bearing_rad")
 
 
 def direction(ahead: Any, left: Any) -> Any:
-    """Angle of a vector from the first axis to the second one, in (-pi, pi]. Complex entries are accepted."""
+    """Return the angle of a vector from the first axis to the second axis, in (-pi, pi]; 0 for the vector 0.
+
+    Complex entries are accepted.
+    """
     ahead, left = complex(ahead), complex(left)
+    if not ahead.real and not left.real:
+        return 0.0
     half_turn = math.copysign(math.pi, left.real)
     if abs(left.real) > abs(ahead.real):
         return half_turn / 2.0 - cmath.atan(ahead / left)

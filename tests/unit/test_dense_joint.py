@@ -1,5 +1,7 @@
 """The oracle of the exact estimators against the Kalman filter in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,11 +22,15 @@ START = Start(
 STD = {"x_m": 0.3, "y_m": 0.5}
 
 
-def test_two_nodes_are_a_prediction_a_correction_and_a_smoothing_step() -> None:
+@pytest.mark.parametrize("speed_mps", [10.0, 0.0])
+def test_two_nodes_are_a_prediction_a_correction_and_a_smoothing_step(
+    speed_mps: float,
+) -> None:
+    start = replace(START, speed_mps=speed_mps)
     motion = CV(velocity_density_m2ps3=0.8)
     measurement = Measurement.of(2 * NS, x_m=20.0, y_m=9.0, std=STD).seen_by(motion)
-    found = dense_joint(motion, START, [measurement], [0, 2 * NS, 3 * NS])
-    x0, P0 = initial_state(motion, START)
+    found = dense_joint(motion, start, [measurement], [0, 2 * NS, 3 * NS])
+    x0, P0 = initial_state(motion, start)
     F, H = motion.jacobian(x0, 2.0), np.eye(2, 4)
     x, P = F @ x0, F @ P0 @ F.T + motion.process_noise(x0, 2.0)
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag([0.09, 0.25]))
