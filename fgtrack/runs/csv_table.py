@@ -8,6 +8,7 @@ from warnings import catch_warnings
 
 import numpy as np
 
+from fgtrack.core.cells import guarded, unguarded
 from fgtrack.core.files import open_file
 from fgtrack.runs.columns import Columns
 from fgtrack.runs.rows import Row, text, text_header
@@ -112,7 +113,7 @@ def _converter(name: str) -> Callable[[str], str | int | float]:
     if column_type(name) is float:
         return lambda cell: float(cell) if cell else math.nan
     return (
-        str
+        unguarded
         if column_type(name) is str
         else lambda cell: int(cell) if cell or name != "track_id" else NO_TRACK
     )
@@ -125,6 +126,9 @@ def _lines(table: str, columns: Columns, is_scored: bool) -> str:
     frame = pandas.DataFrame(dict(columns))
     if table == "tracks" and not is_scored:
         frame = frame.drop(columns=SCORE)
+    for name in frame:
+        if column_type(name) is str:
+            frame[name] = frame[name].map(guarded)
     if table == "updates":
         frame["track_id"] = (
             frame["track_id"].astype("Int64").replace(NO_TRACK, pandas.NA)

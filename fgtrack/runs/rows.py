@@ -5,6 +5,7 @@ from functools import lru_cache
 from operator import attrgetter, itemgetter
 from typing import Any
 
+from fgtrack.core.cells import guarded
 from fgtrack.core.types import (
     DESCRIBING,
     MEASURABLE,
@@ -161,10 +162,10 @@ def _format(kind: type) -> str:
 
 @lru_cache
 def _quoted(name: Cell) -> Cell:
-    """Return `name` as a CSV cell, in quotes if necessary."""
+    """Return `name` as a CSV cell, in quotes if necessary, and never as a formula."""
     if name is None:
         return None
-    name = str(name)
+    name = guarded(str(name))
     return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
 
 

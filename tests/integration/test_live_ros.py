@@ -370,11 +370,18 @@ def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
     assert (counts(node), node.tracker.refused, node.buffer.known) == ({}, {}, {})
 
 
+@pytest.mark.parametrize(
+    ("scenario", "duration_s"),
+    [
+        ("single_opponent", 4.0),
+        pytest.param("default", 60.0, marks=pytest.mark.slow, id="demo"),
+    ],
+)
 def test_a_bag_through_the_node_gives_the_tracks_of_its_replay(
-    script: ModuleType, tmp_path: Path
+    script: ModuleType, tmp_path: Path, scenario: str, duration_s: float
 ) -> None:
     """The recorded messages go in as bytes, and the tracks come out as bytes of another bag."""
-    drive = fgtrack.simulate("single_opponent", seed=1, duration_s=4.0)
+    drive = fgtrack.simulate(scenario, seed=1, duration_s=duration_s)
     write_bag(tmp_path / "in", drive)
     sensors = ("lidar_cluster", "radar")
     topics = {f"/detections/{sensor}": f"{sensor}/detections" for sensor in sensors}

@@ -1,3 +1,4 @@
+import csv
 import dataclasses
 import hashlib
 import json
@@ -22,6 +23,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
+from fgtrack.evaluation.tables import Table
 from fgtrack.runs import (
     COLUMNS,
     NO_TRACK,
@@ -135,6 +137,41 @@ def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
     np.testing.assert_array_equal(found["bearing_rad"], [math.nan, 0.3, math.nan])
     write(tmp_path / "without", report())
     assert finished["digest"] == digest(tmp_path / "without")
+
+
+FORMULAS = (
+    '=HYPERLINK("//a","b")',
+    "@SUM(1)",
+    "+1+2",
+    "-2+3",
+    "\tx",
+    "'=x",
+    "'",
+)
+"""Names from a recording that a spreadsheet could run."""
+
+
+def test_no_name_from_a_recording_is_a_formula_in_a_spreadsheet(tmp_path):
+    """The names come back; numbers and other names stay as they are in the file."""
+    path, names = tmp_path / "run", [*FORMULAS, "-3", "+1e5", "a=b", "it's"]
+    seen = [Detection(x_m=1.0, y_m=2.0, class_name=name, id=name) for name in names]
+    with RunWriter(path) as writer:
+        writer.write_detections(DetectionList("=1+1", 5, 9, seen, "map"))
+        writer.write_tick(report(), 5, 2)
+        writer.finish({})
+    run = load_run(path)
+    run.save(tmp_path / "again")
+    for folder in (path, tmp_path / "again"):
+        found = load_run(folder).tables["detections"]
+        assert found["sensor"].tolist() == ["=1+1"] * len(names)
+        assert found["class_name"].tolist() == found["id"].tolist() == names
+        with (folder / "detections.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        cells = [row["class_name"] for row in rows]
+        assert cells == [*(f"'{name}" for name in FORMULAS[:-1]), *names[6:]]
+    table = Table("found", [{"run": FORMULAS[0], "number": -1.5}], ())
+    assert table.to_csv().splitlines()[1].startswith("\"'=HYPERLINK")
+    assert table.to_csv().endswith(",-1.5\n")
 
 
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):

@@ -14,6 +14,7 @@ from rich.markup import escape as rich_escape
 from rich.table import Table as Grid
 from rich.text import Text
 
+from fgtrack.core.cells import guarded
 from fgtrack.core.errors import printable, printable_lines
 
 Value = str | int | float
@@ -430,7 +431,14 @@ def html_cell(tag: str, content: str, is_left: bool) -> str:
 def _csv(records: Sequence[Record]) -> str:
     import pandas as pd
 
-    text: str = pd.DataFrame(records, dtype=object).to_csv(
+    cells = [
+        {
+            name: guarded(value) if isinstance(value, str) else value
+            for name, value in record.items()
+        }
+        for record in records
+    ]
+    text: str = pd.DataFrame(cells, dtype=object).to_csv(
         index=False, lineterminator="\n"
     )
     return text
