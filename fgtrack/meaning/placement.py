@@ -40,7 +40,9 @@ def frame_decisions(sample: Sample) -> Iterator[Decision]:
         if item is None or _is_geodetic(item):
             continue
         test = None
-        if name in points:
+        is_polar = name in points and points[name].is_polar
+        # Ranges and bearings in a table are measured from the sensor, whatever the motion.
+        if name in points and not (isinstance(item, CsvTable) and is_polar):
             test = frame_of(points[name], motion)
         if isinstance(item, TopicInput):
             yield from _topic_frame(name, path, headers, points.get(name), test)
