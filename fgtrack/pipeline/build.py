@@ -53,9 +53,11 @@ from fgtrack.tracking.lives.existence import (
     Lifecycle,
 )
 from fgtrack.tracking.lives.latency import Views, Watermarks
+from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.stamped_facing import StampedFacing
+from fgtrack.tracking.stamped_objects import StampedObjects
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 #: Stored ego states of the published implementation.
@@ -105,6 +107,7 @@ def build_tracker(
         else None,
         suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,
+        objects=StampedObjects() if decides else Objects(),
         facing=_build_facing(config, motion.cartesian),
         road=road,
         watermarks=Watermarks(config.sensors, [EGO]),

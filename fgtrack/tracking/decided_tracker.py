@@ -16,7 +16,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Measurement, Measurements, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
-from fgtrack.tracking.decisions.entries import NOTHING, Entry
+from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.history import Decisions, Explained, Settled
 from fgtrack.tracking.decisions.lives import DecidedLives, Life
 from fgtrack.tracking.decisions.nodes import NONE, Ended
@@ -28,6 +28,7 @@ from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocessed
 from fgtrack.tracking.replaced_lists import Replaced, tracks_of
 from fgtrack.tracking.stamped_facing import StampedFacing
+from fgtrack.tracking.stamped_objects import Key, StampedObjects
 from fgtrack.tracking.tracker import MultiObjectTracker
 
 _FIRST_REBUILT = 1_000_000_000
@@ -79,6 +80,7 @@ class DecidedTracker(MultiObjectTracker):
         "_of",
         "_fused_as",
         "_beliefs",
+        "_firsts",
         "_unposed",
         "_lists",
         "num_revisions",
@@ -101,6 +103,11 @@ class DecidedTracker(MultiObjectTracker):
         self._beliefs: dict[tuple[int, int], tuple[int, tuple[float, int]]] = {}
         """Track in the bank, and belief about its front before it has fused a candidate; keys as in `_fused_as`."""
         self._facing = parts.facing if isinstance(parts.facing, StampedFacing) else None
+        self._objects = (
+            parts.objects if isinstance(parts.objects, StampedObjects) else None
+        )
+        self._firsts: dict[int, _Place] = {}
+        """First detections, before the horizon, of tracks that no estimator holds."""
         self._unposed: list[Batch] = []
         """Lists that could not be placed in the map: no state of the ego was near."""
         self._lists = ListEntries(parts, decisions)
@@ -165,15 +172,36 @@ class DecidedTracker(MultiObjectTracker):
             self._lists.settle(each.entry)
             number, scan = each.entry.number, each.entry.scan
             publics = self._of.pop(number)
+            self._keep_firsts(each.entry, publics)
             for position in range(len(publics)):
                 self._fused_as.pop((number, position), None)
                 self._beliefs.pop((number, position), None)
             if self._facing is not None:
                 chosen = [k for k, public in enumerate(publics) if public is not None]
                 self._facing.settle(scan.sensor, scan.stamp_ns, chosen)
+        if settled:
+            self._drop_firsts()
+        if self._objects is not None:
+            self._objects.settle(oldest_ns)
         _settle(settled, self._final, self._ended)
         self._tracks.end(self._lives.ended_before(oldest_ns))
         self._unposed = [each for each in self._unposed if each.stamp_ns >= oldest_ns]
+
+    def _keep_firsts(self, entry: Entry, publics: Sequence[int | None]) -> None:
+        """Keep the first detections of tracks that no estimator holds, and that late data may bring back."""
+        for position, public in enumerate(publics):
+            if public is not None and self._is_unknown(public):
+                self._firsts.setdefault(public, _Place(entry, position, public))
+
+    def _drop_firsts(self) -> None:
+        """Forget the first detections of tracks that no hypothesis has."""
+        if self._firsts:
+            possible = self.decisions.roots
+            self._firsts = {
+                public: place
+                for public, place in self._firsts.items()
+                if self._roots.get(public) in possible
+            }
 
     def _process_waiting(self) -> bool:
         """See `MultiObjectTracker._process_waiting`. Lists whose poses have become known better are decided again."""
@@ -405,6 +433,7 @@ class DecidedTracker(MultiObjectTracker):
             if bank_id is not None:
                 self._tracks.drop(bank_id)
         if anew:
+            chosen += [self._firsts[each] for each in anew if each in self._firsts]
             chosen += [
                 _Place(each, position, public)
                 for each in self.decisions.entries
@@ -427,7 +456,7 @@ class DecidedTracker(MultiObjectTracker):
             self._fuse(own, rest, own is newest)
             for place in births:
                 begun.add(place.track)
-                self._birth(own, place.position, is_again=place.track in anew)
+                self._birth(place, is_again=place.track in anew)
 
     def _read_newer(
         self, anew: set[int], lost: Sequence[_Place], won: Sequence[_Place]
@@ -543,29 +572,24 @@ class DecidedTracker(MultiObjectTracker):
     def _leaves_no_trace(self, place: _Place) -> bool:
         """True for a candidate from which a track learns nothing but its state."""
         known = self._fused_as.get(place.key)
-        return (
-            known is not None
-            and place.entry.descriptions[place.position] is NOTHING
-            and "yaw_rad" not in known[1].model.components
-        )
+        return known is not None and "yaw_rad" not in known[1].model.components
 
     def _withdraw(self, place: _Place) -> bool:
-        """Undo the fusion of a candidate with its former track. Return False if the bank cannot undo it.
-
-        What the track has learned from a class, an identity or a yaw stays.
-        """
+        """Undo the fusion of a candidate with its former track. Return False if the bank cannot undo it."""
         known = self._fused_as.pop(place.key, None)
         if known is None:
             return True
         bank_id, stack, row = known
+        if self._objects is not None:
+            self._objects.take_back(bank_id, _key(place.entry, place.position))
         if not self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
             return False
         self._tracks.num_measured[bank_id] -= 1
         return True
 
-    def _birth(self, entry: Entry, position: int, is_again: bool = False) -> None:
+    def _birth(self, place: _Place, is_again: bool) -> None:
         """Start the estimator of a track."""
-        public = cast(int, self._of[entry.number][position])
+        entry, position, public = place.entry, place.position, place.track
         start = entry.start(position)
         if start is None:
             return
@@ -586,9 +610,7 @@ class DecidedTracker(MultiObjectTracker):
                 self._facing.born(
                     bank_id, entry.scan.sensor, start, candidate.measurement
                 )
-            parts.objects.learn(
-                bank_id, entry.candidates.described(entry.batch, position)
-            )
+            self._tell(bank_id, entry, position)
         except Exception as error:
             parts.contain(error, Failure.BIRTH_FAILED)
             self._tracks.end([bank_id])
@@ -627,16 +649,18 @@ class DecidedTracker(MultiObjectTracker):
             position, track = pairs[k]
             bank_id = states.track_ids[track]
             self._fused_as[entry.number, position] = bank_id, stack, row
-        if parts.objects.describes(entry.scan.objects):
-            for position, track in pairs:
-                parts.objects.learn(
-                    states.track_ids[track],
-                    entry.candidates.described(entry.batch, position),
-                )
+        for position, track in pairs:
+            self._tell(states.track_ids[track], entry, position)
         if is_recorded:
             for made in records:
                 for one in made:
                     self._results[one.index] = one
+
+    def _tell(self, bank_id: int, entry: Entry, position: int) -> None:
+        """Let the detections of a candidate describe a track."""
+        if self._objects is not None and entry.is_described:
+            detections = entry.candidates.described(entry.batch, position)
+            self._objects.tell(bank_id, _key(entry, position), detections)
 
     def _readings(
         self, entry: Entry, pairs: list[tuple[int, int]], states: StatesAt
@@ -738,6 +762,12 @@ class DecidedTracker(MultiObjectTracker):
             self._records += candidates.records(
                 batch, [position], disposition, public if is_birth else None
             )
+
+
+def _key(entry: Entry, position: int) -> Key:
+    """Return stamp and sensor of a list, and the index of a candidate's detection."""
+    leader = entry.candidates.leaders[position]
+    return entry.batch.stamp_ns, entry.batch.message.sensor, leader
 
 
 def _settle(

@@ -41,7 +41,7 @@ _NO_DESCRIPTION = None, None, None, None, None
 
 
 @dataclass(slots=True)
-class _Seen:
+class Seen:
     """Classes and sizes that the detections of one track have reported."""
 
     classes: Counter[str] = field(default_factory=Counter)
@@ -50,6 +50,28 @@ class _Seen:
     sizes_m: dict[str, float] = field(default_factory=dict)
     """Their means."""
     ids: Counter[str] = field(default_factory=Counter)
+
+    def copy(self) -> "Seen":
+        """Return a copy."""
+        return Seen(
+            self.classes.copy(),
+            self.num_sizes.copy(),
+            self.sizes_m.copy(),
+            self.ids.copy(),
+        )
+
+    def add(self, detection: Detection) -> None:
+        """Add class, size and identity of a detection."""
+        if detection.class_name is not None:
+            self.classes[detection.class_name] += 1
+        if detection.id is not None:
+            self.ids[detection.id] += 1
+        for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
+            if value is not None:
+                self.num_sizes[name] += 1
+                mean = self.sizes_m.get(name, 0.0)
+                share = 1.0 / self.num_sizes[name]
+                self.sizes_m[name] = mean + share * (value - mean)
 
 
 class Evidence:
@@ -117,7 +139,7 @@ class Objects(Stateful):
     )
 
     def __init__(self) -> None:
-        self._seen: dict[int, _Seen] = {}
+        self._seen: dict[int, Seen] = {}
         self._ids: dict[int, str] = {}  # of most detections, by track
         self._owners: dict[
             str, set[int]
@@ -139,16 +161,14 @@ class Objects(Stateful):
         for detection in detections:
             if not self.describes([detection]):
                 continue
-            seen = self._seen.setdefault(track_id, _Seen())
-            if detection.class_name is not None:
-                seen.classes[detection.class_name] += 1
+            seen = self._seen.setdefault(track_id, Seen())
+            known, is_first = self._ids.get(track_id), not seen.ids
+            seen.add(detection)
             if detection.id is not None:
-                known = self._ids.get(track_id)
-                if not seen.ids and detection.id in self._owners:
+                if is_first and detection.id in self._owners:
                     self.id_conflicts["reused"] += 1
                 if known not in (None, detection.id):
                     self.id_conflicts["changed"] += 1
-                seen.ids[detection.id] += 1
                 self._strays.pop(detection.id, None)
                 if detection.id != known and seen.ids[detection.id] > seen.ids.get(
                     known or "", 0
@@ -156,13 +176,6 @@ class Objects(Stateful):
                     self._disown(track_id)
                     self._ids[track_id] = detection.id
                     self._owners.setdefault(detection.id, set()).add(track_id)
-            for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
-                if value is not None:
-                    seen.num_sizes[name] += 1
-                    mean = seen.sizes_m.get(name, 0.0)
-                    seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (
-                        value - mean
-                    )
 
     def owner(self, detection: Detection) -> int | None:
         """Return the only track with the identity of `detection`.
@@ -282,7 +295,7 @@ class Objects(Stateful):
                 del self._owners[identity]
         return identity
 
-    def _report(self, seen: _Seen) -> ObjectReport:
+    def _report(self, seen: Seen) -> ObjectReport:
         name = _most(seen.classes)
         share = None if name is None else seen.classes[name] / seen.classes.total()
         length_m, width_m, height_m = map(seen.sizes_m.get, _SIZES)

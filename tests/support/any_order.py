@@ -21,6 +21,9 @@ SECOND = 1_000_000_000
 SIDE_M = 160.0
 STD_M, BEARING_STD_RAD, DOPPLER_STD_MPS, YAW_STD_RAD = 0.3, 0.01, 0.3, 0.1
 HORIZON_S = 2.5
+#: A track that is less probable at present ends without any list, once the lists up to now are usually there.
+LEAST_EXISTENCE = 0.02
+SURE_EXISTENCE = 0.6
 #: Measured components of each kind of sensor.
 KINDS: Mapping[str, Mapping[str, float]] = {
     "position": {"x_m": STD_M, "y_m": STD_M},
@@ -38,13 +41,18 @@ Message = EgoState | DetectionList
 Key = tuple[str, int, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene:
     """Messages of a scene, each received at its stamp, and the configuration of a tracker."""
 
+    label: str
+    """Arguments of `drawn`."""
     messages: Sequence[Message]
     config: Mapping[str, Any]
     length_s: float
+
+    def __repr__(self) -> str:
+        return f"drawn({self.label})"
 
     def late(self, seed: int, lists_s: float, ego_s: float = 0.0) -> "Scene":
         """Return the scene with random delays up to `lists_s` of the lists, and up to `ego_s` of the ego's states."""
@@ -123,7 +131,7 @@ def drawn(
         sensors[name] = {
             "std": dict(std),
             "detection_probability": 0.85,
-            "clutter_per_m2": clutter / SIDE_M**2,
+            "clutter_per_m2": max(clutter, 0.1) / SIDE_M**2,
         }
         for t_s in np.arange(0.013 + 0.021 * k, length_s, 0.1 + 0.03 * k).tolist():
             ego = ego_at(t_s)
@@ -157,7 +165,8 @@ def drawn(
         "smoother": {"lag_s": HORIZON_S},
         **config,
     }
-    return Scene(messages, given, length_s)
+    label = f"{seed}, {kinds}, {num_objects=}, {detected=}, {clutter=}, {frame=}"
+    return Scene(label, messages, given, length_s)
 
 
 def _detection(
@@ -211,7 +220,7 @@ class Outcome:
     of: dict[Key, Key | None]
     """Track of each detection by its first detection."""
     statuses: dict[Key, Any]
-    """Status of each track at the end, by its first detection."""
+    """Status and description of each probable track at the end, by its first detection."""
     records: list[UpdateRecord] = field(repr=False, default_factory=list)
     revisions: list[Revision] = field(repr=False, default_factory=list)
 
@@ -235,7 +244,11 @@ def outcome(scene: Scene) -> Outcome:
     reports: list[tuple[int, TrackReport]] = []
     for back_s in (0.0, 0.5, 1.0):
         stamp_ns = round((scene.length_s - back_s) * SECOND)
-        reports += [(stamp_ns, each) for each in tracker.tracks_at(stamp_ns)]
+        reports += [
+            (stamp_ns, each)
+            for each in tracker.tracks_at(stamp_ns)
+            if (each.score or 0.0) > LEAST_EXISTENCE
+        ]
     tracker.finish()
     revisions += tracker.revised()
     assert not tracker.failures.counts
@@ -250,9 +263,9 @@ def outcome(scene: Scene) -> Outcome:
         if each.track_id in first
     }
     statuses = {
-        first[each.track_id]: each.status
+        first[each.track_id]: (each.status, each.object)
         for _, each in reports
-        if each.track_id in first
+        if each.track_id in first and (each.score or 0.0) > SURE_EXISTENCE
     }
     return Outcome(
         states,

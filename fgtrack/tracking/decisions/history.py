@@ -80,6 +80,12 @@ class Decisions(Stateful):
         return None if step is None else step.nodes.at(step.hypotheses[0].rows)
 
     @property
+    def roots(self) -> set[int]:
+        """Tracks of all hypotheses after the newest list."""
+        step = self.newest
+        return set() if step is None else set(step.nodes.roots.tolist())
+
+    @property
     def entries(self) -> list[Entry]:
         """All lists inside the horizon, in the order of their stamps."""
         return [step.entry for step in self._steps if step.entry is not None]

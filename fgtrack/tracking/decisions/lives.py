@@ -92,14 +92,18 @@ class DecidedLives(Stateful):
         watermarks_ns: IntArray | None = None,
         processed_ns: int = FOREVER,
     ) -> list[int]:
-        """Return the tracks that have become improbable without any list."""
+        """Suspend the tracks that have become improbable without any list: a late list may still show them."""
         self._present_ns = present_ns
         known_ns = present_ns
         if watermarks_ns is not None and len(watermarks_ns):
             known_ns = min(known_ns, int(watermarks_ns.min()))
         self._known_ns = min(known_ns, processed_ns)
         least = self._rules.delete_probability
-        return [i for i, life in self.lives.items() if life.at(self._known_ns) < least]
+        for each in [
+            i for i, life in self.lives.items() if life.at(self._known_ns) < least
+        ]:
+            self.suspend(each, self._known_ns)
+        return []
 
     def suspended(self, stamp_ns: int | None = None) -> frozenset[int]:
         """Return the tracks that are not published."""
