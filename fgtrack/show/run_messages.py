@@ -127,9 +127,7 @@ def ego_messages(ego: Columns, at_ns: int) -> Messages:
 def truth_messages(truth: Columns) -> Messages:
     """Yield boxes and poses of the true objects at every stamp, without the ego."""
     table = with_position(truth.where(truth["object_id"] != EGO_ID))
-    # A long column is read from the file at each use, so the blocks come from columns in memory.
-    names = ("stamp_ns", "object_id", "x_m", "y_m", "yaw_rad")
-    table = Columns({name: table[name] for name in names})
+    table = _in_memory(table, "stamp_ns", "object_id", "x_m", "y_m", "yaw_rad")
     before: set[str] = set()
     for rows in _blocks(table["stamp_ns"], np.unique(table["stamp_ns"])):
         yield from _merged(_truth_messages(table.where(rows), before))
@@ -174,7 +172,7 @@ def _tick_messages(run: Run, layer: RunLayer) -> Messages:
     """Yield the messages of all ticks, of which some hundred are in memory at a time."""
     timing = run.tables["timing"]
     names = ("now_ns", "stamp_ns", "track_id", "status", "speed_mps", *_POSE)
-    tracks = Columns({name: run.tables["tracks"][name] for name in names})
+    tracks = _in_memory(run.tables["tracks"], *names)
     times_ns = np.union1d(timing["now_ns"], tracks["now_ns"])
     before = _Before()
     blocks = zip(
@@ -314,7 +312,7 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
     track at the tick that fused it. The arrow is opaque for an out-of-sequence
     detection, and faint otherwise.
     """
-    table = run.tables["detections"]
+    table = _in_memory(run.tables["detections"], "receipt_ns", "sensor", "stamp_ns")
     where = detections_in_map(run)
     rows = update_rows(run)
     # Row -1 selects the empty text at the end.
@@ -422,7 +420,7 @@ def _outcome_messages(run: Run, layer: RunLayer) -> Messages:
         "track_id",
         "nis",
     )
-    updates = run.tables["updates"]
+    updates = _in_memory(run.tables["updates"], *names)
     receipts_ns = np.unique(updates["receipt_ns"])
     rows = chain.from_iterable(
         _rows(updates.where(block), *names)
@@ -507,6 +505,14 @@ def _states(states: Columns, objects: Columns) -> list[Detection]:
             )
         )
     return result
+
+
+def _in_memory(table: Columns, *names: str) -> Columns:
+    """Return the columns `names` of `table` in memory.
+
+    A long column of a Parquet file would be read again for each block of rows.
+    """
+    return Columns({name: table[name] for name in names})
 
 
 def _rows(

@@ -13,6 +13,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.runs import Columns
 from fgtrack.runs.schema import Column
+from fgtrack.show.figures.bands import draw_values
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import legend_above, usual_step_ns
 
@@ -78,7 +79,8 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             )
         for axes, sensor in zip(rows, sensors, strict=True):
             mine = (fates == name) & (updates["sensor"] == sensor)
-            axes.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, color=color)
+            if mine.any():
+                draw_values(axes, received_s[mine], delay_ms[mine], color, ms=4.0)
     for axes, sensor in zip(rows, sensors, strict=True):
         axes.set_ylim(low_ms, high_ms + 0.05 * (high_ms - low_ms))
         axes.set_title(sensor.replace("_", " "), loc="left", y=0.98, pad=1.0)

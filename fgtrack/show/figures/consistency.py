@@ -12,6 +12,7 @@ from fgtrack.evaluation.matching import position_nees
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.evaluation.scores.statistics import chi_square_band
+from fgtrack.show.figures.bands import BAND_NOTE, MOST_DOTS, draw_values, thinned
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import (
     GREY,
@@ -89,16 +90,14 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             )
             at_ns = at_ns.astype(np.int64)
             band = chi_square_band(expected * length, np.full(len(mean), length))
-            axes.plot(
-                since_ns / NS_PER_S,
-                values,
-                ".",
-                ms=3.0,
-                mew=0,
-                color=colour,
-                alpha=0.5,
-                rasterized=True,
-            )
+            draw_values(axes, since_ns / NS_PER_S, values, colour)
+        is_dense = name == _NEES and len(at_ns) > MOST_DOTS
+        if is_dense:
+            draw_values(axes, at_ns / NS_PER_S, mean, colour)
+            line = f"; {BAND_NOTE}"
+        few = thinned(len(at_ns))
+        at_ns, band = at_ns[few], (band[0][few], band[1][few])
+        mean, expected = mean[few], expected[few]
         step_ns = usual_step_ns(at_ns)
         time_s = at_ns / NS_PER_S
         x_s, y = broken_line(at_ns, time_s, mean, step_ns)
@@ -108,7 +107,9 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
         share_inside = f"{100.0 * inside.mean():.0f} % of the {unit} in their band"
         label = f"{subject}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share_inside}{line}"
-        axes.plot(x_s, y, color=colour, lw=1.1, label=label)
+        axes.plot(
+            *((x_s, y) if not is_dense else ([], [])), color=colour, lw=1.1, label=label
+        )
         axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
         # The axis is logarithmic, so only positive values count.
         positive = values[values > 0.0]

@@ -21,6 +21,7 @@ from fgtrack.evaluation.runs import (
 )
 from fgtrack.evaluation.scores.lagged import final_errors
 from fgtrack.evaluation.scores.statistics import Moments
+from fgtrack.show.figures.bands import thinned
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import (
     broken_line,
@@ -91,7 +92,9 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
                 times_ns, factor * values[name], nanoseconds(window_s)
             )
             axes.plot(
-                *broken_line(at_ns, at_ns / NS_PER_S, rms, step_ns),
+                *broken_line(
+                    at_ns, at_ns / NS_PER_S, rms, max(step_ns, usual_step_ns(at_ns))
+                ),
                 color=style.colour,
                 ls=style.line,
                 lw=1.4,
@@ -151,6 +154,7 @@ def moving_rms(
     stamps_ns = stamps_ns[known]
     sums = np.concatenate([[0.0], np.cumsum(np.square(values[known]))])
     distinct_ns = np.unique(stamps_ns)
+    distinct_ns = distinct_ns[thinned(len(distinct_ns))]
     first = np.searchsorted(stamps_ns, distinct_ns - window_ns // 2, side="left")
     last = np.searchsorted(stamps_ns, distinct_ns + window_ns // 2, side="right")
     return distinct_ns, np.sqrt(

@@ -11,6 +11,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
+from fgtrack.show.figures.bands import draw_values
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import bulk, legend_above
 from fgtrack.show.palette import SENSORS
@@ -66,16 +67,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             mean = round(moments.mean, 3) + 0.0  # no negative zero
             ending = f" ({outside} outside)" if outside else ""
             label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}{ending}"
-            over_time.plot(
-                time_s[mine],
-                sample,
-                ".",
-                ms=3.0,
-                alpha=0.6,
-                mew=0,
-                color=colour,
-                label=label,
-            )
+            draw_values(over_time, time_s[mine], sample, colour, label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
             histogram.stairs(
                 density, bins, orientation="horizontal", color=colour, lw=1.4
