@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
+from fgtrack.advice.changes import Recorded
 from fgtrack.advice.checks import Check, Evidence, checks
 from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
@@ -44,6 +45,7 @@ from fgtrack.meaning.times import clock_constant
 from fgtrack.noise.parameters import TuneRules
 from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.runs import Run
 from fgtrack.tracking.ego.trajectory import MAX_EXTRAPOLATION_S
 
 __all__ = ["Adviser", "advise"]
@@ -186,6 +188,8 @@ class Adviser:
                 for item in noise_findings(new)
                 if evidence.doubt(item.about) is None
             )
+        self._on_step("parts", 0.5)
+        self._take(self._changes())
         if tune and new is not None:
             self._adopt(self._tuned(new))
         old = self._outcome(before)
@@ -396,6 +400,14 @@ class Adviser:
         )
         yield from bias_findings(self._clocks, self._config.ego)
 
+    def _changes(self) -> Iterator[Finding]:
+        """Yield what changes along a long recording: clocks, mounts and noise."""
+        if not self._is_useless:
+            config = self._config
+            yield from Recorded(
+                self._messages, config, lambda part: self._run(part, config)
+            ).findings()
+
     def _late(self, shares: Mapping[str, float]) -> Iterator[Finding]:
         """Yield a finding if lists are often overtaken and the estimator cannot handle this."""
         often = {name: share for name, share in shares.items() if share > _OFTEN}
@@ -494,25 +506,31 @@ class Adviser:
     def _outcome(self, config: Config) -> RunQuality | None:
         """Return the outcome of the first minutes with `config`; None if nothing can be tracked.
 
-        A smoother is replaced by the replaying EKF, which is faster. Outcomes are
-        cached.
+        Outcomes are cached.
         """
         for known, outcome in self._outcomes:
             if known == config:
                 return outcome
-        fast = config
-        result = None
+        run = self._run(self._tracked, config)
+        result = None if run is None else RunQuality.of(run)
+        self._outcomes.append((config, result))
+        return result
+
+    def _run(self, messages: Sequence[Message], config: Config) -> Run | None:
+        """Return the run of `messages` with `config`; None if nothing can be tracked.
+
+        A smoother is replaced by the replaying EKF, which is faster.
+        """
         if config.estimator.startswith("smoother"):
             storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
-            fast = replace(
-                fast,
+            config = replace(
+                config,
                 estimator="ekf-replay",
                 filter=replace(config.filter, storage_s=storage_s),
             )
         with suppress(DataError):
-            result = RunQuality.of(replay_in_memory(self._tracked, fast))
-        self._outcomes.append((config, result))
-        return result
+            return replay_in_memory(messages, config)
+        return None
 
     def _evidence(
         self, seen: Mapping[str, Arrivals], outcome: RunQuality | None

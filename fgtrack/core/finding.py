@@ -15,7 +15,7 @@ class Finding:
     """A problem in a sentence or two with numbers, and settings; `str` gives both."""
 
     kind: str
-    """Subject: `input`, `model`, `clock`, `late`, `window`, `ego`, `mount`, `noise`, `tune`, `track`."""
+    """Subject: `input`, `model`, `clock`, `late`, `window`, `ego`, `mount`, `noise`, `change`, `tune`, `track`."""
     about: str
     """Name of a sensor, `ego`, or another subject."""
     weight: float
