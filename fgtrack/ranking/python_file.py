@@ -3,7 +3,9 @@
 import importlib
 import importlib.util
 import inspect
+import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -134,9 +136,7 @@ class PythonMethod(Method):
         except (MethodError, NotImplementedError):
             raise
         except Exception as error:
-            raise MethodError(
-                f"{type(error).__name__}: {one_line(str(error))}"
-            ) from error
+            raise self._failure(error) from error
         if len(raw) != len(problem.queries):
             raise MethodError(
                 f"{len(problem.queries)} answers are expected, {len(raw)} came"
@@ -161,9 +161,7 @@ class PythonMethod(Method):
         except (MethodError, NotImplementedError):
             raise
         except Exception as error:
-            raise MethodError(
-                f"{type(error).__name__}: {one_line(str(error))}"
-            ) from error
+            raise self._failure(error) from error
         return Tracks(tuple(found), time.process_time() - started_s)
 
     def _scan_by_scan(self, problem: CrowdProblem) -> list[dict[int, FloatArray]]:
@@ -197,6 +195,15 @@ class PythonMethod(Method):
                 }
             )
         return found
+
+    def _failure(self, error: Exception) -> MethodError:
+        """Return the error of the method, with its last line in the file of the method."""
+        text = f"{type(error).__name__}: {one_line(str(error))}"
+        file = getattr(sys.modules.get(self._code.__module__), "__file__", None)
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == file]
+        where = f"{Path(file).name}, line {lines[-1]}: " if file and lines else ""
+        return MethodError(where + text)
 
     def _made(self, given: Given | GivenCrowd) -> Any:
         """Return an object of the class. Raises `MethodError` if the class does not take `given`."""
@@ -371,6 +378,7 @@ def _module(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[module.__name__] = module  # dataclasses look their module up there
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -379,6 +379,22 @@ def test_a_class_without_given_is_told_to_take_it() -> None:
     )
 
 
+def test_a_file_may_hold_dataclasses(tmp_path: Path) -> None:
+    head = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+    node = "@dataclass\nclass Node:\n    x: float\n"
+    path = written(tmp_path / "own.py", head + node + SORTED + FUSE)
+    assert rank(path).deviations[:, 0].max() < EXACT
+
+
+def test_an_error_of_a_method_has_its_line(tmp_path: Path) -> None:
+    text = SHORT.replace("return [1.0]", "return {}['x']")
+    result = rank(written(tmp_path / "own.py", text))
+    assert result.problem == "own.py, line 5: KeyError: 'x'"
+    typed: dict[str, Any] = {"__name__": "no_module"}  # as at a prompt
+    exec(text, typed)
+    assert rank(typed["One"]).problem == "KeyError: 'x'"
+
+
 def test_a_file_without_a_method_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallError, match="define a class with update"):
         method(written(tmp_path / "empty.py", "x = 1\n"))
