@@ -258,6 +258,10 @@ class Hypotheses(Association):
     kind: Literal["hypotheses"] = "hypotheses"
     most: PositiveInt = 8
     """Largest number of hypotheses."""
+    revise: bool = True
+    """True if late lists change decisions. Otherwise a list that is older than the newest list is too old, as it always
+    is for the estimator `drop` and for smoothers with `smoother.late: drop`.
+    """
 
     @property
     def reads_yaws(self) -> bool:

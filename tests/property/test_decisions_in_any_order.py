@@ -251,6 +251,39 @@ def test_a_checkpoint_of_the_decisions_goes_on_with_the_same_bits() -> None:
     assert rest() == first
 
 
+@pytest.mark.parametrize(
+    ("estimator", "revise"), [("drop", True), ("ekf-replay", False)]
+)
+def test_late_lists_change_no_decision_of_a_tracker_that_drops_them(
+    estimator: str, revise: bool
+) -> None:
+    lists = scene(5, num_objects=3)[:60]
+    newest_ns, in_order = 0, []
+    late = delays(lists, 5, 0.5)
+    arrivals = sorted(
+        zip(lists, late, strict=True), key=lambda each: each[0][1] + each[1]
+    )
+    for each, delay_ns in arrivals:
+        tick = -(-(each[1] + delay_ns) * 20 // SECOND)
+        in_order.append((tick, each))
+    in_order.sort(key=lambda each: (each[0], each[1][1]))
+    taken = []
+    for _, each in in_order:
+        if each[1] >= newest_ns:
+            newest_ns = each[1]
+            taken.append(each)
+    config = configuration(
+        estimator, association={"kind": "hypotheses", "most": 6, "revise": revise}
+    )
+    found = outcome(lists, late, config)
+    old = sum(each.disposition is Disposition.TOO_OLD for each in found.records)
+    assert old == sum(len(each[2]) for each in lists) - sum(
+        len(each[2]) for each in taken
+    )
+    alone = outcome(taken, [0] * len(taken), configuration("ekf-replay"))
+    assert found.groups() == alone.groups()
+
+
 def test_every_detection_ends_once() -> None:
     lists = scene(5)
     found = outcome(lists, delays(lists, 5, 1.0), configuration("ekf-replay"))

@@ -54,7 +54,10 @@ class Decisions(Stateful):
         "_next_list",
     )
 
-    def __init__(self, rules: Rules, num_sensors: int) -> None:
+    def __init__(
+        self, rules: Rules, num_sensors: int, takes_late_lists: bool = True
+    ) -> None:
+        self._takes_late_lists = takes_late_lists
         self._rules, self._num_sensors = rules, num_sensors
         self._steps: list[Step] = []
         self._first: Step | None = None
@@ -91,7 +94,9 @@ class Decisions(Stateful):
         return [step.entry for step in self._steps if step.entry is not None]
 
     def is_too_old(self, stamp_ns: int) -> bool:
-        """True for a stamp before the lists that are decided for good."""
+        """True for a stamp before the lists that are decided for good, or late where no late list is taken."""
+        if not self._takes_late_lists and self._steps:
+            return stamp_ns < self._steps[-1].stamp_ns
         return self._first is not None and (
             self._first.entry is not None and stamp_ns < self._first.stamp_ns
         )
