@@ -1,187 +1,324 @@
-"""Are the final tracks of late lists those of lists in order?
+"""What does it gain to take decisions back: in the present, some time ago, and in the final tracks?
 
-    python experiments/any_order/any_order.py -o out/any_order --seeds 10 --jobs 2
+    python experiments/any_order/any_order.py -o out/any_order --seeds 10 --jobs 2 \
+        --oos-mtt OOS_MTT --kitti KITTI --autoferry AUTOFERRY --airport LEBL
 
-Twelve objects in clutter are seen by a LiDAR and a RADAR. The lists arrive in order, or with delays.
+Twelve cars in clutter are seen by a LiDAR and a RADAR. The lists arrive in order, or with delays. The four
+folders are those of the recordings (docs/recordings.md); a scene without its folder is left out.
+`outputs.csv` has the scores of each output, `runs.csv` the shares of states that are as in order.
 """
 
 import csv
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import dense_scene
 import numpy as np
 import typer
 from joblib import Parallel, delayed
+from outputs import final_states, outputs, scores, share
 
 import fgtrack
-from fgtrack import NS_PER_S, Config, Detection, DetectionList, FloatArray, Run
+from fgtrack import Config, DetectionList, Message, TruthState, open_input
+from fgtrack.evaluation.scores.revisions import revision_metrics
+from fgtrack.evaluation.settings import evaluation_settings
+from fgtrack.sim import ConstantDelay, SensorDelays, redelay
 
-NUM_OBJECTS = 12
-LENGTH_S = 20.0
-SIDE_M = 200.0
-FALSE_PER_LIST = 4.0
-PERIOD_S = 0.1
-SPEED_STD_MPS = 6.0
-STDS_M: Mapping[str, float] = {"lidar": 0.3, "radar": 0.8}
-DETECTED: Mapping[str, float] = {"lidar": 0.85, "radar": 0.7}
-OFFSETS_S: Mapping[str, float] = {"lidar": 0.013, "radar": 0.041}
-#: Delays of the sensors, by label.
-DELAYS_S: Mapping[str, Mapping[str, float]] = {
+IN_ORDER = "in order"
+ONCE, REVISED, ONE, WAITING = (
+    "decided once",
+    "revised",
+    "revised, one hypothesis",
+    "reorder-buffer",
+)
+METHODS: Mapping[str, Mapping[str, object]] = {
+    ONCE: {"association": {"kind": "mahalanobis"}},
+    REVISED: {"association": {"kind": "hypotheses"}},
+    ONE: {"association": {"kind": "hypotheses", "most": 1}},
+    WAITING: {"association": {"kind": "mahalanobis"}, "estimator": "reorder-buffer"},
+}
+"""Settings of each method."""
+DENSE_DELAYS_S: Mapping[str, Mapping[str, float]] = {
+    IN_ORDER: {"lidar": 0.0, "radar": 0.0},
     "of the paper": {"lidar": 0.151, "radar": 0.062},
     "LiDAR 0.5 s": {"lidar": 0.5, "radar": 0.062},
     "LiDAR 1 s": {"lidar": 1.0, "radar": 0.062},
 }
-#: Associations, by label.
-ASSOCIATIONS: Mapping[str, str] = {
-    "decided once": "mahalanobis",
-    "hypotheses": "hypotheses",
+"""Delays of the sensors in the dense scene, by label."""
+KITTI_DELAY_S, AUTOFERRY_DELAY_S, AIRPORT_DELAY_S = 0.3, 1.0, 2.0
+AIRPORT_S = 120.0
+STATIONS = {
+    7: {"latitude_deg": 41.29561833, "longitude_deg": 2.095114167},
+    107: {"latitude_deg": 41.29706278, "longitude_deg": 2.07844722},
 }
-NEAR_M = 0.05
 
 
-class Row(NamedTuple):
-    """Result of one stream."""
+class Scene(NamedTuple):
+    """A stream in one arrangement of delays, and the tracker of its recording."""
 
-    decisions: str
+    name: str
+    part: str
+    """Seed or recording."""
     delays: str
-    seed: int
-    share: float
-    """Share of the final states of the stream in order that the late stream has too."""
-    tracks: int
-    """Number of confirmed tracks."""
-    revised: int
-    """Number of detections whose track late data has changed."""
+    messages: Sequence[Message]
+    config: Config
 
 
-def lists(seed: int) -> list[tuple[str, int, list[Detection]]]:
-    """Return sensor, stamp and detections of all lists."""
-    rng = np.random.default_rng(seed)
-    first_m = rng.uniform(-0.5 * SIDE_M, 0.5 * SIDE_M, (NUM_OBJECTS, 2))
-    velocities_mps = rng.normal(0.0, SPEED_STD_MPS, (NUM_OBJECTS, 2))
-    begins_s = rng.uniform(0.0, 0.5 * LENGTH_S, NUM_OBJECTS)
-    begins_s[: NUM_OBJECTS // 2] = 0.0
-    ends_s = begins_s + rng.uniform(0.25, 1.0, NUM_OBJECTS) * LENGTH_S
-    found = []
-    for sensor, offset_s in OFFSETS_S.items():
-        for time_s in np.arange(offset_s, LENGTH_S, PERIOD_S).tolist():
-            seen = [
-                first_m[k]
-                + velocities_mps[k] * (time_s - begins_s[k])
-                + rng.normal(0.0, STDS_M[sensor], 2)
-                for k in range(NUM_OBJECTS)
-                if begins_s[k] <= time_s < ends_s[k] and rng.random() < DETECTED[sensor]
-            ]
-            number = rng.poisson(FALSE_PER_LIST)
-            seen += list(rng.uniform(-0.5 * SIDE_M, 0.5 * SIDE_M, (number, 2)))
-            objects = [Detection(x_m=float(x), y_m=float(y)) for x, y in seen]
-            found.append((sensor, round(time_s * NS_PER_S), objects))
-    return sorted(found, key=lambda each: each[1])
+class OutputRow(NamedTuple):
+    """Scores of one output of one run: a row of `outputs.csv`."""
+
+    scene: str
+    part: str
+    delays: str
+    method: str
+    output: str
+    mota: float
+    switches: int
+    rmse_m: float
+    t_gospa_m: float
 
 
-def configuration(association: str) -> Config:
-    """Return the tracker of the scene."""
-    return Config.from_dict(
-        {
-            "estimator": "smoother-banded",
-            "association": {"kind": association},
-            "sensors": {
-                name: {
-                    "std": {"x_m": std_m, "y_m": std_m},
-                    "detection_probability": DETECTED[name],
-                    "clutter_per_m2": FALSE_PER_LIST / SIDE_M**2,
-                }
-                for name, std_m in STDS_M.items()
-            },
-            "motion": {"kind": "cv", "std_per_s": {"velocity": 5.0}},
-            "birth": {"speed_std_mps": 10.0},
-            "clock": {"node_hz": 50.0},
-            "filter": {"storage_s": 3.0},
-            "smoother": {"lag_s": 3.0},
-        }
+class RunRow(NamedTuple):
+    """Agreement of one run with the run in order, and what it has taken back: a row of `runs.csv`."""
+
+    scene: str
+    part: str
+    delays: str
+    method: str
+    as_in_order: float
+    """Share of all final states in order that the run has too, confirmed or not; NaN for a filter."""
+    confirmed_as_in_order: float
+    """Share of the final states of confirmed tracks."""
+    revised_share: float
+    """Share of the detections whose track was changed."""
+    moved_share: float
+    """Share of the published states that moved outside of their 95 % ellipse."""
+    withdrawn_share: float
+    """Share of the published states that were withdrawn."""
+
+
+Rows = tuple[list[OutputRow], list[RunRow]]
+
+
+def dense_scenes(seed: int) -> Iterator[Scene]:
+    """Yield the dense scene in each arrangement of delays, in order first."""
+    config = dense_scene.configuration()
+    for delays, delays_s in DENSE_DELAYS_S.items():
+        own = dense_scene.messages(seed, delays_s)
+        yield Scene("dense", str(seed), delays, own, config)
+
+
+def recorded_scenes(
+    name: str, source: Path, config: Config, sensor: str, delay_s: float
+) -> Iterator[Scene]:
+    """Yield a recording with the lists of one sensor at their stamps, and late."""
+    every = list(open_input(source, config.input).messages())
+    for own_s in (0.0, delay_s):
+        delays = {sensor: SensorDelays(ConstantDelay(own_s))}
+        messages = list(redelay(every, delays, np.random.default_rng(0))[0])
+        label = f"{sensor} {own_s:g} s" if own_s else IN_ORDER
+        yield Scene(name, source.stem, label, messages, config)
+
+
+def lagged(config: Config) -> Config:
+    """Return `config` with the estimator and the lags of this experiment. Decisions are as old as the window."""
+    smoother = replace(config.smoother, lagged_s=dense_scene.LAGS_S, ring_s=0.0)
+    return replace(config, estimator="smoother-banded", smoother=smoother)
+
+
+def airport_scenes(folder: Path) -> Iterator[Scene]:
+    """Yield the first two minutes of an airport, with the RADAR at its stamps, and late. It has no truth."""
+    config = lagged(
+        Config.from_yaml("airport").replace({"input.asterix.stations": STATIONS})
     )
+    for each in recorded_scenes("airport", folder, config, "smr", AIRPORT_DELAY_S):
+        last_ns = min(one.stamp_ns for one in each.messages) + round(AIRPORT_S * 1e9)
+        kept = [one for one in each.messages if one.stamp_ns < last_ns]
+        yield each._replace(messages=kept)
 
 
-def replayed(seed: int, delays_s: Mapping[str, float], association: str) -> Run:
-    """Return the run of a scene whose lists arrive with these delays."""
-    messages = [
-        DetectionList(
-            sensor,
-            stamp_ns,
-            stamp_ns + round(delays_s[sensor] * NS_PER_S),
-            objects,
-            frame="map",
+def benchmark_scenes(path: Path) -> Iterator[Scene]:
+    """Yield a scene of the benchmark in order, and with its late scans."""
+    sys.path.append(str(Path(__file__).parents[1] / "oos_mtt"))
+    from oos_mtt import configuration
+    from scenes import nanoseconds, read_scene
+
+    scene = read_scene(path)
+    config = configuration("smoother-banded").replace(
+        {"evaluation.gate_m": 10.0, "smoother.ring_s": 0.0}
+    )
+    truth = [
+        TruthState(
+            nanoseconds(scene.times_s[index]),
+            nanoseconds(scene.times_s[index]),
+            number,
+            *map(float, point_m),
         )
-        for sensor, stamp_ns, objects in lists(seed)
+        for number, trajectory in enumerate(scene.truth)
+        for index, point_m in trajectory.items()
     ]
-    messages.sort(key=lambda each: each.receipt_ns)
-    return fgtrack.replay(messages, configuration(association))
+    for label, own in ((IN_ORDER, scene.in_order()), ("late scans", scene)):
+        lists: list[Message] = [*own.messages(), *truth]
+        lists.sort(key=lambda each: each.receipt_ns)
+        name = path.name.partition(".")[0]
+        yield Scene("oos_mtt", name, label, lists, config)
 
 
-def final_states(run: Run) -> dict[int, FloatArray]:
-    """Return the final positions (m, 2) of confirmed tracks, by stamp."""
-    tracks, smoothed = run.tracks, run.smoothed
-    confirmed = set(tracks["track_id"][tracks["status"] != "tentative"])
-    final = smoothed[
-        (smoothed["kind"] == "final") & smoothed["track_id"].isin(confirmed)
-    ]
-    found: dict[int, list[tuple[float, float]]] = {}
-    for stamp_ns, x_m, y_m in final[["stamp_ns", "x_m", "y_m"]].itertuples(index=False):
-        found.setdefault(int(stamp_ns), []).append((x_m, y_m))
-    return {stamp_ns: np.array(points) for stamp_ns, points in found.items()}
+def settings(scene: Scene, method: str) -> Config:
+    """Return the tracker of a method: the decisions of the recording's configuration, if it has them."""
+    own = dict(METHODS[method])
+    association = scene.config.association
+    if dict(own["association"]) == {"kind": association.kind}:  # type: ignore[call-overload]
+        del own["association"]
+    config = scene.config
+    if method == WAITING:
+        longest_s = max(
+            (each.receipt_ns - each.stamp_ns) / fgtrack.NS_PER_S
+            for each in scene.messages
+            if isinstance(each, DetectionList)
+        )
+        own["options"] = {WAITING: {"hold_s": max(longest_s, 0.01)}}
+    return config.replace(own)
 
 
-def share(expected: Mapping[int, FloatArray], found: Mapping[int, FloatArray]) -> float:
-    """Return the share of `expected` states with a state of `found` at the same stamp, at most 5 cm away."""
-    total = equal = 0
-    for stamp_ns, points in expected.items():
-        total += len(points)
-        others = found.get(stamp_ns)
-        if others is not None:
-            apart_m = np.linalg.norm(points[:, None] - others[None], axis=2)
-            equal += int((apart_m.min(axis=1) <= NEAR_M).sum())
-    return equal / max(total, 1)
+def judged(arrangements: Sequence[Scene], method: str) -> Rows:
+    """Return the rows of one method on one scene in each arrangement, in order first."""
+    expected: list[Mapping[int, np.ndarray]] = []
+    of_outputs: list[OutputRow] = []
+    of_runs: list[RunRow] = []
+    for scene in arrangements:
+        run = fgtrack.replay(scene.messages, settings(scene, method))
+        head = scene.name, scene.part, scene.delays, method
+        for name, output in outputs(run):
+            of_outputs.append(OutputRow(*head, name, *scores(output)))
+        states = [final_states(run), final_states(run, confirmed_only=True)]
+        expected = expected or states
+        of = revision_metrics(run, evaluation_settings(run))
+        published = int((run.tables["tracks"]["status"] != "tentative").sum())
+        shares = [share(*each) for each in zip(expected, states, strict=True)]
+        withdrawn = of.withdrawn_states / max(published, 1)
+        of_runs.append(
+            RunRow(*head, *shares, of.revised_share, of.moved_share, withdrawn)
+        )
+    return of_outputs, of_runs
 
 
-def judged(seed: int, label: str) -> list[Row]:
-    """Return the rows of one scene with one kind of decisions."""
-    none = dict.fromkeys(OFFSETS_S, 0.0)
-    expected = final_states(replayed(seed, none, ASSOCIATIONS[label]))
-    rows = []
-    for delays, delays_s in DELAYS_S.items():
-        run = replayed(seed, delays_s, ASSOCIATIONS[label])
-        tracks = run.tracks
-        confirmed = set(tracks["track_id"][tracks["status"] != "tentative"])
-        own = share(expected, final_states(run))
-        rows.append(Row(label, delays, seed, own, len(confirmed), len(run.revisions)))
-    return rows
+def interval(values: Sequence[float]) -> str:
+    """Return the mean, with half of its 95 % interval (t) if there are several values."""
+    from scipy.stats import t
+
+    known = np.array([each for each in values if np.isfinite(each)])
+    if not len(known):
+        return "-"
+    mean = f"{known.mean():.3g}"
+    if len(known) == 1:
+        return mean
+    half = t.ppf(0.975, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known))
+    return f"{mean} ± {half:.2g}"
+
+
+def table(
+    rows: Iterable[OutputRow | RunRow], keys: Sequence[str], values: Sequence[str]
+) -> list[str]:
+    """Return the lines of a table: means over the parts of each scene."""
+    found: dict[tuple[str, ...], list[OutputRow | RunRow]] = {}
+    for row in rows:
+        found.setdefault(tuple(getattr(row, key) for key in keys), []).append(row)
+    lines = [f"| {' | '.join((*keys, *values))} |", "|---" * (len(keys) + len(values))]
+    lines[1] += "|"
+    for key, own in found.items():
+        cells = [
+            interval(
+                [
+                    (100.0 if "share" in name or "order" in name else 1.0)
+                    * getattr(row, name)
+                    for row in own
+                ]
+            )
+            for name in values
+        ]
+        lines.append(f"| {' | '.join((*key, *cells))} |")
+    return lines
+
+
+def write(path: Path, rows: Sequence[OutputRow] | Sequence[RunRow]) -> None:
+    """Write all rows as CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(rows[0]._fields)
+        writer.writerows(rows)
+
+
+Folder = Annotated[Path | None, typer.Option(help="Folder of the recordings.")]
 
 
 def main(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder.")] = Path("out"),
-    seeds: Annotated[int, typer.Option(help="Number of scenes.")] = 10,
+    seeds: Annotated[int, typer.Option(help="Number of dense scenes.")] = 10,
     jobs: Annotated[int, typer.Option(help="Number of processes.")] = 1,
+    methods: Annotated[
+        str, typer.Option(help="Methods, separated by semicolons.")
+    ] = ";".join(METHODS),
+    oos_mtt: Folder = None,
+    kitti: Folder = None,
+    autoferry: Folder = None,
+    airport: Folder = None,
 ) -> None:
-    """Print the share of equal final states for each kind of decisions and delays, and write all rows."""
-    tasks = [(seed, label) for label in ASSOCIATIONS for seed in range(seeds)]
-    found = Parallel(n_jobs=jobs)(delayed(judged)(*task) for task in tasks)
-    rows = [row for of_task in found for row in of_task]
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "any_order.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(Row._fields)
-        writer.writerows(rows)
-    for label in ASSOCIATIONS:
-        for delays in DELAYS_S:
-            own = [
-                row for row in rows if (row.decisions, row.delays) == (label, delays)
-            ]
-            shares = np.array([row.share for row in own])
-            revised = np.mean([row.revised for row in own])
-            typer.echo(
-                f"{label}, delays {delays}: {100.0 * shares.mean():.2f} % of the final states as in order "
-                f"(least {100.0 * shares.min():.2f} %), {revised:.0f} detections revised"
+    """Print the means of all scores, and write `outputs.csv` and `runs.csv`."""
+    groups = [list(dense_scenes(seed)) for seed in range(seeds)]
+    if oos_mtt is not None:
+        groups += [
+            list(benchmark_scenes(each)) for each in sorted(oos_mtt.glob("scene*"))
+        ]
+    if kitti is not None:
+        config = lagged(Config.from_yaml("kitti"))
+        groups += [
+            list(
+                recorded_scenes(
+                    f"KITTI {name}",
+                    kitti / "oxts" / f"{name}.txt",
+                    config,
+                    "pointrcnn_car",
+                    KITTI_DELAY_S,
+                )
             )
+            for name in ("0006", "0018")
+        ]
+    if autoferry is not None:
+        config = lagged(Config.from_yaml("autoferry"))
+        groups += [
+            list(
+                recorded_scenes(
+                    f"Autoferry {number}",
+                    autoferry / f"scenario{number}",
+                    config,
+                    "lidar",
+                    AUTOFERRY_DELAY_S,
+                )
+            )
+            for number in (3, 6)
+        ]
+    if airport is not None:
+        groups.append(list(airport_scenes(airport)))
+    tasks = [(group, method) for group in groups for method in methods.split(";")]
+    found = Parallel(n_jobs=jobs, return_as="generator")(
+        delayed(judged)(*task) for task in tasks
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    of_outputs: list[OutputRow] = []
+    of_runs: list[RunRow] = []
+    for outputs_of_task, runs_of_task in found:
+        of_outputs += outputs_of_task
+        of_runs += runs_of_task
+        write(out / "outputs.csv", of_outputs)
+        write(out / "runs.csv", of_runs)
+    heads = ("scene", "delays", "method")
+    typer.echo("\n".join(table(of_runs, heads, RunRow._fields[4:])))
+    typer.echo("")
+    typer.echo("\n".join(table(of_outputs, (*heads, "output"), OutputRow._fields[5:])))
 
 
 if __name__ == "__main__":
