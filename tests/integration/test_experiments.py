@@ -11,12 +11,19 @@ from support.scripts import EXPERIMENTS, load
 
 from fgtrack.config.reading import read_config
 
-sys.path.insert(0, str(EXPERIMENTS / "real_data"))
+for folder in ("any_order", "real_data"):
+    sys.path.insert(0, str(EXPERIMENTS / folder))
 
 pytestmark = pytest.mark.slow
 
 #: Script, options of a short run, what else makes it short, and the rows of its table; a name for the rest.
 SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
+    "any_order": (
+        {"seeds": 1, "methods": "decided once;revised"},
+        {"DENSE_DELAYS_S": {"in order": {"lidar": 0.0, "radar": 0.0}}},
+        "runs.csv",
+        2,
+    ),
     "association": ({"runs": 2, "duration_s": 2.0}, {}, "judged.csv", 0),
     "association/crossings": (
         {"runs": 2, "duration_s": 2.5, "jobs": 1},
