@@ -104,7 +104,7 @@ class _Recording:
         states = with_position(states)
         states = states.where(np.isfinite(self.seconds(states[time])))
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
-        return Columns({name: values[keys] for name, values in states.items()})
+        return states.where(keys)
 
     def columns(self, states: Columns, time: str) -> Json:
         """Return the columns of the viewer for rows of `states`: times, positions, and yaws if there are any.
