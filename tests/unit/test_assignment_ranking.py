@@ -1,6 +1,6 @@
 """Ranked assignments equal those of a search over all assignments."""
 
-from itertools import islice, product
+from itertools import product
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def ranked(pairs: list[Pair], most: int) -> list[Ranked]:
     """Return the best assignments of pairs of five tracks and five candidates."""
     tracks, candidates, values = (np.array(each) for each in zip(*pairs, strict=True))
     problem = Gains.of(tracks, candidates, values, 5, 5)
-    return list(islice(best_assignments([(0.0, problem)]), most))
+    return best_assignments([(0.0, problem)], most)
 
 
 def taken_pairs(own: Ranked) -> frozenset[tuple[int, int]]:
@@ -80,6 +80,32 @@ def test_the_order_of_the_pairs_does_not_matter() -> None:
 
 def test_without_pairs_all_tracks_are_missed() -> None:
     nothing = np.zeros(0, dtype=np.int64)
-    [only] = best_assignments([(0.0, Gains.of(nothing, nothing, np.zeros(0), 2, 3))])
+    [only] = best_assignments([(0.0, Gains.of(nothing, nothing, np.zeros(0), 2, 3))], 3)
     assert only.gain == 0.0
     assert only.candidates.tolist() == [-1, -1]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_best_assignments_of_several_problems_are_ranked_together(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    problems, expected = [], []
+    for number in range(3):
+        gain = float(rng.normal())
+        pairs = [
+            (i, j, float(rng.normal(1.0, 4.0))) for i in range(3) for j in range(3)
+        ]
+        tracks, candidates, values = (
+            np.array(each) for each in zip(*pairs, strict=True)
+        )
+        problems.append((gain, Gains.of(tracks, candidates, values, 3, 3)))
+        expected += [
+            (gain + own, number, taken) for own, taken in every_assignment(pairs)
+        ]
+    expected = sorted(expected, key=lambda each: -each[0])[:5]
+    least = expected[0][0] - LARGEST_LOSS
+    found = best_assignments(problems, 5)
+    assert [
+        (pytest.approx(each.gain), each.problem, taken_pairs(each)) for each in found
+    ] == [each for each in expected if each[0] > least]

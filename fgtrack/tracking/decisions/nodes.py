@@ -34,6 +34,8 @@ class Nodes:
     """Numbers of the tracks: of the detections that started them."""
     hazards_hz: FloatArray
     """Rates at which the probability of existence decays until the next list."""
+    hits: IntArray
+    """Numbers of detections."""
     counts: IntArray
     """Numbers of detections by `sensors`."""
     misses: IntArray
@@ -57,6 +59,7 @@ class Nodes:
             self.first_m.take(rows, axis=0),
             self.roots.take(rows),
             self.hazards_hz.take(rows),
+            self.hits.take(rows),
             self.counts.take(rows),
             self.misses.take(rows),
             self.sensors.take(rows),
@@ -115,6 +118,7 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
         np.zeros((0, 2)),
         np.zeros(0, dtype=np.int64),
         np.zeros(0),
+        np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),

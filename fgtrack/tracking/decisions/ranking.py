@@ -2,6 +2,7 @@
 
 import heapq
 import math
+from bisect import insort
 from collections.abc import Iterator, Sequence
 from itertools import count
 from typing import NamedTuple
@@ -69,33 +70,48 @@ class Ranked(NamedTuple):
     """Candidate of each track, `NONE` for a missed one, shape (n,)."""
 
 
-def best_assignments(problems: Sequence[tuple[float, Gains]]) -> Iterator[Ranked]:
-    """Yield the assignments of all `problems`, the best one first; `problems` are gains of problems, and of pairs.
+def best_assignments(
+    problems: Sequence[tuple[float, Gains]], most: int
+) -> list[Ranked]:
+    """Return at most `most` assignments of all `problems`, the best one first.
 
-    Each track and each candidate of a problem is used at most once. Assignments that are less likely than the best one
-    by more than `LARGEST_LOSS` are left out.
+    `problems` are the gains of problems, and of pairs. Each track and each candidate of a problem is used at most
+    once. Assignments that are less likely than the best one by more than `LARGEST_LOSS` are left out.
     """
     solved = [
         _Problem(number, gain, gains) for number, (gain, gains) in enumerate(problems)
     ]
-    least = max(each.best.gain for each in solved) - LARGEST_LOSS
-    solved = [each for each in solved if each.best.gain >= least]
+    gains = sorted(each.best.gain for each in solved)  # of the best `most` solutions
+    lowest = gains[-1] - LARGEST_LOSS
     numbers = count()  # the earlier of two equal gains comes first
     heap: list[tuple[float, int, _Problem, _Solution, int | None]] = [
-        (-each.best.gain, next(numbers), each, each.best, None) for each in solved
+        (-each.best.gain, next(numbers), each, each.best, None)
+        for each in solved
+        if each.best.gain >= lowest
     ]
     heapq.heapify(heap)
-    while heap:
+    found: list[Ranked] = []
+    while heap and len(found) < most:
         _, _, problem, solution, position = heapq.heappop(heap)
         if position is None:
-            yield problem.ranked(solution)
+            found.append(problem.ranked(solution))
+            if solution is problem.best:
+                problem.restrict(lowest)
+            least = _least(gains, most, lowest)
             for position, bound in problem.bounds(solution, least):
                 entry = (-bound, next(numbers), problem, solution, position)
                 heapq.heappush(heap, entry)
             continue
         branch = problem.branch(solution, position)
-        if branch is not None and branch.gain >= least:
+        if branch is not None and branch.gain >= _least(gains, most, lowest):
+            insort(gains, branch.gain)
             heapq.heappush(heap, (-branch.gain, next(numbers), problem, branch, None))
+    return found
+
+
+def _least(gains: Sequence[float], most: int, lowest: float) -> float:
+    """Return the gain below which a solution is none of the best `most`; `gains` of solutions ascend."""
+    return max(lowest, gains[-most]) if len(gains) >= most else lowest
 
 
 class _Solution(NamedTuple):
@@ -138,12 +154,13 @@ class _Problem:
         candidates[taken] = self._gains.candidates[candidates[taken]]
         return Ranked(solution.gain, self._number, candidates)
 
-    def _restrict(self, least: float) -> None:
+    def restrict(self, least: float) -> None:
         """Leave out the pairs whose assignments have gains below `least`; find the tracks that still have a choice."""
         n, m = self._num_tracks, self._gains.num_candidates
         row_prices, column_prices = self._prices
         limit = self.best.gain - least + _ROUNDING
-        owners = np.repeat(np.arange(n), np.diff(self._gains.first))
+        counts = np.diff(self._gains.first)
+        owners = np.repeat(np.arange(n), counts)
         losses = (
             self._costs - row_prices[owners] - column_prices[self._gains.candidates]
         )
@@ -157,27 +174,22 @@ class _Problem:
         self._open = order[is_open[order]]
         self._positions = np.full(n, len(order))
         self._positions[self._open] = np.arange(len(self._open))
-        # The two least losses of each track, and the pair of the least one.
-        every = np.concatenate(
-            [np.where(self._is_allowed, losses, math.inf), missed_losses]
-        )
-        of = np.concatenate([owners, np.arange(n)])
-        pairs = np.concatenate([np.arange(len(losses)), np.full(n, NONE)])
-        by_loss = np.lexsort((every, of))
-        starts = np.searchsorted(of[by_loss], np.arange(n))
-        self._likeliest = pairs[by_loss[starts]]
-        following = np.minimum(starts + 1, max(len(by_loss) - 1, 0))
-        has_second = of[by_loss[following]] == np.arange(n)
-        has_second &= following > starts
-        self._second_losses = np.where(has_second, every[by_loss[following]], math.inf)
+        # The pair with the least loss of each track, and the least loss of another pair.
+        every = np.full((n, 1 + int(counts.max(initial=0))), math.inf)
+        of_pair = np.arange(len(losses)) - self._gains.first[owners]
+        every[owners, of_pair] = np.where(self._is_allowed, losses, math.inf)
+        every[:, -1] = missed_losses
+        likeliest = every.argmin(axis=1)
+        every[np.arange(n), likeliest] = math.inf
+        is_missed = likeliest == every.shape[1] - 1
+        self._likeliest = np.where(is_missed, NONE, self._gains.first[:-1] + likeliest)
+        self._second_losses = every.min(axis=1, initial=math.inf)
 
     def bounds(self, solution: _Solution, least: float) -> Iterator[tuple[int, float]]:
         """Yield the open tracks that may have another pair than in `solution`, and an upper bound of the gain then.
 
-        Bounds below `least` are left out. Every call has the same `least`.
+        Bounds below `least` are left out.
         """
-        if solution is self.best:
-            self._restrict(least)
         tracks = self._open
         is_likeliest = solution.chosen[tracks] == self._likeliest[tracks]
         losses = np.where(is_likeliest, self._second_losses[tracks], 0.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.nodes import Nodes
 from fgtrack.tracking.lives.existence import densities
@@ -68,7 +68,8 @@ def own_probabilities(
 
     The second return moves with the hull: the distance of both tracks is normal with the standard deviation
     of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
-    velocity of its own. A track with fewer detections may be a second return of a track with more detections.
+    velocity of its own. A track with fewer detections may be a second return of a track with more detections; of two
+    tracks with equal numbers, the younger one may.
     """
     own = np.ones(len(nodes.roots))
     if not returns or len(rows) < 2:
@@ -81,13 +82,8 @@ def own_probabilities(
         given = returns.get(int(nodes.sensors[k]))
         if given is None:
             continue
-        hosts = rows[
-            (nodes.counts[rows] > nodes.counts[k])
-            & (
-                np.hypot(*(nodes.means[rows, :2] - nodes.means[k, :2]).T)
-                < 6.0 * given.std_m
-            )
-        ]
+        distances_m = np.hypot(*(nodes.means[rows, :2] - nodes.means[k, :2]).T)
+        hosts = rows[_is_older(nodes, rows, k) & (distances_m < 6.0 * given.std_m)]
         if not len(hosts):
             continue
         x = nodes.means[hosts] - nodes.means[k]
@@ -107,6 +103,16 @@ def own_probabilities(
         odds = np.exp(np.clip(log_return - log_object, -50.0, 50.0)).sum()
         own[k] = 1.0 / (1.0 + odds)
     return own
+
+
+def _is_older(nodes: Nodes, rows: IntArray, k: int) -> BoolArray:
+    """Mask of the tracks in `rows` that have more detections than track `k`, or as many and a greater row number.
+
+    The tracks of the newest list come first.
+    """
+    is_more = nodes.hits[rows] > nodes.hits[k]
+    is_equal = nodes.hits[rows] == nodes.hits[k]
+    return np.asarray(is_more | (is_equal & (rows > k)))
 
 
 def _log_normal(x: FloatArray, P: FloatArray) -> FloatArray:

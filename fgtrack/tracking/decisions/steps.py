@@ -65,7 +65,7 @@ class _Successor(NamedTuple):
 
 
 def _ranked(before: Step, table: Table, most: int) -> list[_Successor]:
-    """Return the best `most` successors of the hypotheses, the best one first. Equal successors are one."""
+    """Return the best `most` successors of the hypotheses, the best one first."""
     problems = [
         (
             each.log_weight + float(table.log_missed[each.rows].sum()),
@@ -73,24 +73,12 @@ def _ranked(before: Step, table: Table, most: int) -> list[_Successor]:
         )
         for each in before.hypotheses
     ]
-    found: dict[tuple[bytes, bytes], _Successor] = {}
-    for weight, parent, candidates in best_assignments(problems):
-        rows = before.hypotheses[parent].rows
-        key = rows.tobytes(), candidates.tobytes()
-        if key not in found and len(found) == most:
-            break
-        own = _Successor(weight, parent, rows, candidates)
-        found[key] = own if key not in found else _merged(found[key], own)
-    ranked = sorted(found.values(), key=lambda each: -each.log_weight)
+    ranked = [
+        _Successor(gain, parent, before.hypotheses[parent].rows, candidates)
+        for gain, parent, candidates in best_assignments(problems, most)
+    ]
     total = float(np.logaddexp.reduce([each.log_weight for each in ranked]))
     return [each._replace(log_weight=each.log_weight - total) for each in ranked]
-
-
-def _merged(first: _Successor, second: _Successor) -> _Successor:
-    """Return the likelier one of two equal successors with the weights of both."""
-    likelier = first if first.log_weight >= second.log_weight else second
-    total = float(np.logaddexp(first.log_weight, second.log_weight))
-    return likelier._replace(log_weight=total)
 
 
 class _Codes(NamedTuple):
