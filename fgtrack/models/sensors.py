@@ -93,7 +93,15 @@ class SecondReturns:
     share: OpenProbability
     """Share of the lists with a detection of an object that have a second one of it."""
     std_m: PositiveFloat
-    """Standard deviation of its distance from the first one, on each axis."""
+    """Standard deviation of its distance from the first one, along the course of the object."""
+    across_std_m: PositiveFloat | None = None
+    """Standard deviation of its distance across the course; null for a third of `std_m`, as hulls are long."""
+
+    @property
+    def stds_m(self) -> tuple[float, float]:
+        """Standard deviations along and across the course."""
+        across_m = self.std_m / 3.0 if self.across_std_m is None else self.across_std_m
+        return self.std_m, across_m
 
 
 @settings

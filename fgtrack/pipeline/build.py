@@ -162,7 +162,7 @@ def _decision_rules(config: Config) -> Rules:
     returns = {
         index: Returns(
             sensor.second_returns.share,
-            sensor.second_returns.std_m,
+            sensor.second_returns.stds_m,
             math.log(odds * sensor.clutter_per_m2),
             sensor.detection_probability * own.visible_share,
         )

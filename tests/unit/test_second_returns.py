@@ -8,8 +8,12 @@ from fgtrack.pipeline.build import build_tracker
 SECOND = 1_000_000_000
 
 
-def confirmed(second_velocity_mps: tuple[float, float], share: float | None) -> int:
-    """Return the number of confirmed tracks of two echoes, the second one with a velocity of its own."""
+def confirmed(
+    second_velocity_mps: tuple[float, float],
+    share: float | None,
+    second_m: tuple[float, float] = (8.0, 0.0),
+) -> int:
+    """Return the number of confirmed tracks of two echoes, the second one with a place and a velocity of its own."""
     returns = None if share is None else {"share": share, "std_m": 6.0}
     config = Config.from_dict(
         {
@@ -32,7 +36,7 @@ def confirmed(second_velocity_mps: tuple[float, float], share: float | None) -> 
     for k in range(60):
         t_s = 0.2 * k
         first = np.array([3.0 * t_s, 0.0])
-        second = np.array([8.0, 0.0]) + np.array(second_velocity_mps) * t_s
+        second = np.array(second_m) + np.array(second_velocity_mps) * t_s
         seen = [first] if k % 10 == 0 else [first, second]
         objects = [
             Detection(x_m=float(x), y_m=float(y))
@@ -53,3 +57,8 @@ def test_the_second_end_of_a_hull_is_no_object() -> None:
 
 def test_a_second_vessel_with_its_own_velocity_is_an_object() -> None:
     assert confirmed((0.0, 3.0), share=0.5) == 2
+
+
+def test_a_vessel_abreast_is_an_object_and_not_the_other_end_of_the_hull() -> None:
+    assert confirmed((3.0, 0.0), share=0.5, second_m=(0.0, 12.0)) == 2
+    assert confirmed((3.0, 0.0), share=0.5, second_m=(12.0, 0.0)) == 1

@@ -16,7 +16,7 @@ NONE = -1
 
 @dataclass(frozen=True)
 class Nodes:
-    """Tracks of all hypotheses at the stamp of a list. Arrays have n tracks."""
+    """Tracks of all hypotheses at the stamp of a list, the youngest first. Arrays have n tracks."""
 
     means: FloatArray
     covariances: FloatArray

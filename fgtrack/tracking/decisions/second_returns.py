@@ -20,7 +20,8 @@ class Returns:
     """Second returns of a sensor."""
 
     share: float
-    std_m: float
+    stds_m: tuple[float, float]
+    """Standard deviations along and across the course."""
     log_new_per_m2: float
     """Logarithm of the density of new objects in a list."""
     detection_probability: float
@@ -52,7 +53,7 @@ def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray:
         rows
     ] * entry.sensor.detection_probability
     y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
-    P = nodes.covariances[rows][:, :2, :2] + own.std_m**2 * np.eye(2)
+    P = nodes.covariances[rows][:, :2, :2] + _spreads_m2(nodes, rows, own.stds_m)
     m, t = y_m.shape[:2]
     spreads = np.tile(P, (m, 1, 1))
     found = densities(y_m.reshape(-1, 2), spreads, np.zeros(spreads.shape))
@@ -66,10 +67,10 @@ def own_probabilities(
     """Return the probability that each track is an object of its own, shape (n,), and no second return of a track in
     `rows`.
 
-    The second return moves with the hull: the distance of both tracks is normal with the standard deviation
+    The second return moves with the hull: the distance of both tracks is normal with the standard deviations
     of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
-    velocity of its own. A track with fewer detections may be a second return of a track with more detections; of two
-    tracks with equal numbers, the younger one may.
+    velocity of its own. A track may be a second return of a track with more detections, or with as many and
+    a greater row number, which is older.
     """
     own = np.ones(len(nodes.roots))
     if not returns or len(rows) < 2:
@@ -83,12 +84,12 @@ def own_probabilities(
         if given is None:
             continue
         distances_m = np.hypot(*(nodes.means[rows, :2] - nodes.means[k, :2]).T)
-        hosts = rows[_is_older(nodes, rows, k) & (distances_m < 6.0 * given.std_m)]
+        hosts = rows[_is_host(nodes, rows, k) & (distances_m < 6.0 * max(given.stds_m))]
         if not len(hosts):
             continue
         x = nodes.means[hosts] - nodes.means[k]
         P = nodes.covariances[hosts] + nodes.covariances[k]
-        size_m2 = given.std_m**2 * np.eye(2)
+        size_m2 = _spreads_m2(nodes, hosts, given.stds_m)
         log_return = (
             np.log(given.share * exists[hosts])
             + _log_normal(x[:, position], P[:, position, position] + size_m2)
@@ -105,11 +106,28 @@ def own_probabilities(
     return own
 
 
-def _is_older(nodes: Nodes, rows: IntArray, k: int) -> BoolArray:
-    """Mask of the tracks in `rows` that have more detections than track `k`, or as many and a greater row number.
+def _spreads_m2(
+    nodes: Nodes, rows: IntArray, stds_m: tuple[float, float]
+) -> FloatArray:
+    """Return the covariances of second returns around the tracks in `rows`, shape (t, 2, 2).
 
-    The tracks of the newest list come first.
+    `stds_m` are those along and across the course. The mean over the uncertain direction of the velocity is taken: an
+    angle with the variance a^2 has the mean cosine of its double exp(-2 a^2).
     """
+    along_m, across_m = stds_m
+    v = nodes.means[rows, 2:4]
+    P = nodes.covariances[rows][:, 2:4, 2:4]
+    speeds2 = np.maximum((v * v).sum(axis=1), 1e-12)
+    variances_rad2 = 0.5 * P.trace(axis1=1, axis2=2) / speeds2
+    is_known = np.exp(-2.0 * variances_rad2)[:, None, None]
+    ahead = v[:, :, None] * v[:, None, :] / speeds2[:, None, None]
+    lengthways = is_known * ahead + 0.5 * (1.0 - is_known) * np.eye(2)
+    crossways = np.eye(2) - lengthways
+    return np.asarray(along_m**2 * lengthways + across_m**2 * crossways)
+
+
+def _is_host(nodes: Nodes, rows: IntArray, k: int) -> BoolArray:
+    """Mask of the tracks in `rows` of which track `k` may be a second return."""
     is_more = nodes.hits[rows] > nodes.hits[k]
     is_equal = nodes.hits[rows] == nodes.hits[k]
     return np.asarray(is_more | (is_equal & (rows > k)))
