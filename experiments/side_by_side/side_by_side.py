@@ -1,4 +1,4 @@
-"""One long hull or two ships: how long until the tracks say so?
+"""One long hull or two ships: how long until the tracks show it?
 
     python experiments/side_by_side/side_by_side.py -o out/side_by_side --seeds 5
 
@@ -82,9 +82,7 @@ def lists(
     return found, np.array(centres)
 
 
-def measured(
-    config: Config, distance_m: float | None, returns: int, seed: int
-) -> Row:
+def measured(config: Config, distance_m: float | None, returns: int, seed: int) -> Row:
     """Return the result of one scene."""
     messages, centres = lists(distance_m, returns, seed)
     run = fgtrack.replay(messages, config)

@@ -110,7 +110,7 @@ def best_assignments(
 
 
 def _least(gains: Sequence[float], most: int, lowest: float) -> float:
-    """Return the gain below which a solution is none of the best `most`; `gains` of solutions ascend."""
+    """Return the gain of the last of the best `most` solutions, at least `lowest`. The `gains` of solutions ascend."""
     return max(lowest, gains[-most]) if len(gains) >= most else lowest
 
 
