@@ -281,6 +281,16 @@ def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     assert west == west_track != wrong == WRONG
 
 
+def test_a_map_of_tracks_with_rare_updates_has_no_empty_close_up(
+    tmp_path: Path,
+) -> None:
+    run = a_run(tmp_path / "run")
+    updates = run.tables["updates"]
+    assert len(plot.map(run).axes) == 2
+    rare = updates.where(np.arange(updates.num_rows) < 2)
+    assert len(plot.map(run.with_tables(updates=rare)).axes) == 1
+
+
 def test_a_line_is_not_drawn_across_a_pause() -> None:
     stamps_ns = START_NS + TICK_NS * np.array([1, 0, 40, 41])
     x, y = broken_line(

@@ -26,8 +26,9 @@ from fgtrack.show.palette import PALETTE
 
 # With more objects, all share two entries of the legend.
 _NAMED_OBJECTS = 8
-# Time before and after the moment of the close-up.
+# Time before and after the moment of the close-up, and its least number of updates of a track.
 _AROUND_S = 0.4
+_FEWEST_UPDATES = 3
 # Least half side of the close-up.
 _LEAST_M = 4.0
 _DETECTIONS = "#8C7A1F"
@@ -139,7 +140,8 @@ class _Window(NamedTuple):
 def _window(run: Run) -> _Window | None:
     """Return the window around the track with the most updates within `_AROUND_S` of a stamp.
 
-    None if there are no updates. If several stamps have as many updates, the first is used.
+    None if no window has three updates. If several stamps have as many updates, the
+    first is used.
     """
     used = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0)
     around_ns = nanoseconds(_AROUND_S)
@@ -154,7 +156,7 @@ def _window(run: Run) -> _Window | None:
     tracks = run.tables["tracks"]
     is_near = np.abs(tracks["stamp_ns"] + earlier_ns) <= around_ns
     positions_m = _positions(tracks.where((tracks["track_id"] == track_id) & is_near))
-    if not count or not len(positions_m):
+    if count < _FEWEST_UPDATES or not len(positions_m):
         return None
     low_m = positions_m.min(axis=0)
     high_m = positions_m.max(axis=0)
