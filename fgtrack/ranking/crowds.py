@@ -86,10 +86,14 @@ class CrowdProblem:
     """True positions of the objects in view for each query."""
     ego: tuple[EgoState, ...] = ()
     """True states of the vehicle with the sensors; empty if the sensors are at rest."""
+    whole: "CrowdProblem | None" = None
+    """Problem that was cut off; None if it is this problem."""
 
     @property
     def max_delay_s(self) -> float:
-        """Longest time from the stamp of a scan to its receipt."""
+        """Longest time from the stamp of a scan to its receipt, also of scans that were cut off."""
+        if self.whole is not None:
+            return self.whole.max_delay_s
         return max(scan.receipt_ns - scan.stamp_ns for scan in self.scans) / NS_PER_S
 
     def cut_after(self, num_known: int) -> "CrowdProblem":
@@ -100,6 +104,7 @@ class CrowdProblem:
             scans=self.scans[:num_known],
             queries=self.queries[:count],
             truth=self.truth[:count],
+            whole=self,
         )
 
 

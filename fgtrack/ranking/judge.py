@@ -16,7 +16,6 @@ from fgtrack.ranking.problem import LAGS_S, Answer, Problem
 from fgtrack.ranking.result import Ranking, Result
 from fgtrack.ranking.scenarios import draw
 
-_NOT_CAUSAL = "its answers change where later rows are missing, or from run to run"
 _PERMUTED = 2
 """Number of runs of a scenario whose arrivals are also given in another order."""
 
@@ -59,8 +58,7 @@ def _judged_tracks(
 ) -> CrowdResult:
     try:
         found = [method.tracks(problem) for problem in problems]
-        if not method.is_causal_for_tracks(problems[0], found[0]):
-            raise MethodError(_NOT_CAUSAL)
+        method.check_causality_of_tracks(problems[0])
     except MethodError as error:
         return CrowdResult.without_tracks(method.name, scenario, str(error))
     except NotImplementedError as error:
@@ -91,8 +89,7 @@ def permuted(problem: Problem, rng: np.random.Generator) -> Problem:
 def _judged(method: Method, scenario: str, problems: Sequence[Problem]) -> Result:
     try:
         found = [method.answers(problem) for problem in problems]
-        if not method.is_causal(problems[0], found[0]):
-            raise MethodError(_NOT_CAUSAL)
+        method.check_causality(problems[0])
         order = _order(method, problems, found)
         peak_bytes = _peak_bytes(method, problems[0])
     except MethodError as error:

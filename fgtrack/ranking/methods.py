@@ -17,9 +17,11 @@ import numpy as np
 from fgtrack.config.settings import Config
 from fgtrack.core.errors import CallError, FgtrackError, one_line
 from fgtrack.core.geometry import rotation
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, Frame, TrackStatus
 from fgtrack.estimation.registry import estimator
 from fgtrack.pipeline.live import Tracker
+from fgtrack.ranking.causality import with_more_queries, with_more_scan_queries
 from fgtrack.ranking.crowd_files import read_tracks, write_crowd
 from fgtrack.ranking.crowds import CrowdProblem, Positions, Scan
 from fgtrack.ranking.files import read_states, write_problem
@@ -81,31 +83,47 @@ class Method(ABC):
         """Answer all queries of a problem with several objects. Raises as `answers`."""
         raise NotImplementedError("it takes one object")
 
-    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
-        """True if the tracks of a query in the middle do not change where later scans are missing."""
-        middle = problem.queries[len(problem.queries) // 2].num_known
-        alone = self.tracks(problem.cut_after(middle)).positions
-        return all(map(_are_same_tracks, alone, found.positions))
+    def check_causality(self, problem: Problem) -> None:
+        """Compare the answers with those to the problem without its later arrivals.
 
-    def is_causal(self, problem: Problem, found: Answers) -> bool:
-        """True if answers do not change where all later arrivals are missing.
-
-        The first query and a query in the middle are tested. `found` holds the answers
-        to the whole problem.
+        Raises `MethodError` with the query whose answer changes.
         """
-        times = sorted({query.num_known for query in problem.queries})
-        for num_known in sorted({times[0], times[len(times) // 2]} - {times[-1]}):
-            cut = cut_after(problem, num_known)
-            alone = self.answers(cut).answers
-            if not all(map(_are_same, alone, found.answers)):
-                return False
-        return True
+        asked, cuts = with_more_queries(problem)
+        found = self.answers(asked).answers
+        for num_known in cuts:
+            alone = self.answers(cut_after(asked, num_known)).answers
+            for query, one, other in zip(asked.queries, alone, found, strict=False):
+                if not _are_same(one, other):
+                    time_s = (query.stamp_ns - problem.start.stamp_ns) / NS_PER_S
+                    raise MethodError(_not_causal(query.num_known, time_s))
+
+    def check_causality_of_tracks(self, problem: CrowdProblem) -> None:
+        """Compare the tracks with those of the problem without its later scans. Raises as `check_causality`."""
+        asked, cuts = with_more_scan_queries(problem)
+        found = self.tracks(asked).positions
+        for num_known in cuts:
+            alone = self.tracks(asked.cut_after(num_known)).positions
+            for query, one, other in zip(asked.queries, alone, found, strict=False):
+                if not _are_same_tracks(one, other):
+                    time_s = (query.stamp_ns - problem.start_ns) / NS_PER_S
+                    raise MethodError(_not_causal(query.num_known, time_s))
+
+
+def _not_causal(num_known: int, time_s: float) -> str:
+    return (
+        f"not causal: the answer for {time_s:.3f} s, after {num_known} arrivals, "
+        "changes where later rows are missing, or from run to run"
+    )
 
 
 def _are_same(a: Answer | None, b: Answer | None) -> bool:
     if a is None or b is None:
         return a is b
-    return bool(np.allclose(a.mean, b.mean, rtol=0.0, atol=_SAME))
+    if a.covariance is None or b.covariance is None:
+        is_same = a.covariance is b.covariance
+    else:
+        is_same = np.allclose(a.covariance, b.covariance, rtol=_SAME, atol=_SAME)
+    return is_same and bool(np.allclose(a.mean, b.mean, rtol=0.0, atol=_SAME))
 
 
 def _are_same_tracks(a: Positions, b: Positions) -> bool:
@@ -120,9 +138,8 @@ class Shipped(Method):
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def is_causal(self, problem: Problem, found: Answers) -> bool:
-        """True: the estimator gets the measurements one by one."""
-        return True
+    def check_causality(self, problem: Problem) -> None:
+        """Do nothing: the estimator gets the measurements one by one."""
 
     def answers(self, problem: Problem) -> Answers:
         """Answer all queries."""
@@ -145,9 +162,8 @@ class Shipped(Method):
                 found.append(answer_of(problem.motion, state))
         return Answers(tuple(found), time.process_time() - started_s, refused)
 
-    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
-        """True: the tracker gets the scans one by one."""
-        return True
+    def check_causality_of_tracks(self, problem: CrowdProblem) -> None:
+        """Do nothing: the tracker gets the scans one by one."""
 
     def tracks(self, problem: CrowdProblem) -> Tracks:
         """Answer all queries with the confirmed tracks."""

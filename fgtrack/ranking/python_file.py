@@ -117,9 +117,10 @@ class PythonMethod(Method):
     def _is_class(self) -> bool:
         return isinstance(self._code, type)
 
-    def is_causal(self, problem: Problem, found: Answers) -> bool:
-        """True for a class, which gets the measurements one by one; a function is tested."""
-        return self._is_class or super().is_causal(problem, found)
+    def check_causality(self, problem: Problem) -> None:
+        """Check a function; a class gets the measurements one by one. Raises as `Method.check_causality`."""
+        if not self._is_class:
+            super().check_causality(problem)
 
     def answers(self, problem: Problem) -> Answers:
         """Answer all queries. Raises `MethodError` if the code raises, see `Method.answers`."""
@@ -147,9 +148,8 @@ class PythonMethod(Method):
             refused,
         )
 
-    def is_causal_for_tracks(self, problem: CrowdProblem, found: Tracks) -> bool:
-        """True: a class gets the scans one by one."""
-        return True
+    def check_causality_of_tracks(self, problem: CrowdProblem) -> None:
+        """Do nothing: a class gets the scans one by one."""
 
     def tracks(self, problem: CrowdProblem) -> Tracks:
         """Answer all queries with the tracks of a class with `tracks_at`. Raises as `answers`."""

@@ -244,14 +244,104 @@ def test_sabotaged_copies_of_all_exact_estimators_are_named() -> None:
             assert "the present estimate departs by up to" in result.sentence
 
 
-def test_a_function_that_uses_later_data_is_refused(tmp_path: Path) -> None:
-    text = SORTED + FUSE.replace("observations[:known]", "observations")
-    path = written(tmp_path / "future.py", text)
-    result = rank(path)
-    assert (
-        result.problem
-        == "its answers change where later rows are missing, or from run to run"
+NEAREST = """
+def fuse(given, observations, queries):
+    answers = []
+    for known, time_s in queries:
+        near = min(observations, key=lambda each: abs(each.stamp_s - time_s))
+        answers.append((near.values["x_m"], near.values["y_m"], 0.0, 0.0))
+    return answers
+"""
+#: The position that is nearest in time in the whole file.
+NEAREST_PROGRAM = """#!{python}
+import csv, sys
+rows = list(csv.DictReader(open(sys.argv[1])))
+states = csv.writer(open(sys.argv[2], "w"))
+states.writerow(("x_m", "y_m", "vx_mps", "vy_mps"))
+seen = [row for row in rows if row["kind"] == "measurement"]
+for query in rows:
+    if query["kind"] == "query":
+        wanted = float(query["stamp_s"])
+        near = min(seen, key=lambda row: abs(float(row["stamp_s"]) - wanted))
+        states.writerow((near["x_m"], near["y_m"], 0.0, 0.0))
+"""
+#: A filter that is exact now. It is given all queries behind all measurements.
+BEHIND = """#!{python}
+import csv, sys
+from types import SimpleNamespace
+from pathlib import Path
+import numpy as np
+sys.path.insert(0, str(Path(__file__).parent))
+import sorted_by_stamp
+folder = Path(sys.argv[1]).parent
+(prior,) = csv.DictReader(open(folder / "prior.csv"))
+P = np.zeros((4, 4))
+for i in range(4):
+    for j in range(i, 4):
+        P[i, j] = P[j, i] = float(prior[f"p_{{i}}_{{j}}"])
+mean = np.array([float(prior[name]) for name in ("x_m", "y_m", "vx_mps", "vy_mps")])
+given = SimpleNamespace(
+    mean=mean, covariance=P, parameters={{"velocity_density_m2ps3": 2.0}}
+)
+rows = list(csv.DictReader(open(sys.argv[1])))
+seen = [
+    SimpleNamespace(
+        stamp_s=float(row["stamp_s"]),
+        values={{name: float(row[name]) for name in ("x_m", "y_m")}},
+        stds={{"x_m": float(row["std_x_m"])}},
     )
+    for row in rows
+    if row["kind"] == "measurement"
+]
+states = csv.writer(open(sys.argv[2], "w"))
+states.writerow(("x_m", "y_m", "vx_mps", "vy_mps"))
+for row in rows:
+    if row["kind"] == "query":
+        states.writerow(sorted_by_stamp.at(given, seen, float(row["stamp_s"]))[0])
+"""
+WITH_POSITIONS = [
+    name for name in SCENARIOS if name not in ("range-bearing", "doppler")
+]
+
+
+@pytest.mark.parametrize("scenario", WITH_POSITIONS)
+def test_a_function_that_takes_the_nearest_position_of_the_file_is_not_causal(
+    tmp_path: Path, scenario: str
+) -> None:
+    problem = rank(written(tmp_path / "nearest.py", NEAREST), scenario).problem
+    assert problem is not None
+    assert re.fullmatch(
+        r"not causal: the answer for [0-9.]+ s, after \d+ arrivals, "
+        "changes where later rows are missing, or from run to run",
+        problem,
+    )
+
+
+@pytest.mark.parametrize("scenario", ["linear", "late-by-1", "late-by-10", "bursts"])
+def test_a_function_that_uses_later_data_is_not_causal(
+    tmp_path: Path, scenario: str
+) -> None:
+    text = SORTED + FUSE.replace("observations[:known]", "observations")
+    result = rank(written(tmp_path / "future.py", text), scenario)
+    assert "no result: not causal: the answer for" in result.sentence
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an executable script")
+def test_a_program_that_uses_later_rows_is_not_causal(tmp_path: Path) -> None:
+    written(tmp_path / "sorted_by_stamp.py", SORTED)
+    for name, text in (("nearest", NEAREST_PROGRAM), ("behind", BEHIND)):
+        path = program(tmp_path / name, text.format(python=sys.executable))
+        result = rank(path, "late-by-10")
+        assert "no result: not causal: the answer for" in result.sentence
+
+
+@pytest.mark.parametrize("scenario", ["linear", "late-by-3", "copies", "doppler"])
+def test_a_function_that_uses_what_is_known_is_causal(
+    tmp_path: Path, scenario: str
+) -> None:
+    text = NEAREST.replace("min(observations,", "min(observations[:known],")
+    text = text.replace('near.values["x_m"], near.values["y_m"]', "near.z[0], 0.0")
+    assert rank(written(tmp_path / "known.py", text), scenario).problem is None
 
 
 class Counting:
@@ -265,16 +355,16 @@ class Counting:
         return self.exact.answers(problem)
 
 
-def test_the_check_for_later_data_costs_less_than_another_run(tmp_path: Path) -> None:
+def test_the_check_for_later_data_costs_less_than_the_judged_runs(
+    tmp_path: Path,
+) -> None:
     path = written(tmp_path / "sorted.py", SORTED + FUSE)
-    one, problem = method(path), draw("linear", 1)
-    found = one.answers(problem)
-    counting = Counting()
-    one.answers = counting.answers  # type: ignore[method-assign]
-    assert one.is_causal(problem, found) is False  # the answers are those of a smoother
-    counting.num_arrivals = 0
-    assert one.is_causal(problem, counting.exact.answers(problem))
-    assert 0 < counting.num_arrivals < len(problem.arrivals)
+    for scenario in SCENARIOS:
+        one, problem = method(path), draw(scenario, 1)
+        counting = Counting()
+        one.answers = counting.answers  # type: ignore[method-assign]
+        one.check_causality(problem)
+        assert 3 < counting.num_arrivals / len(problem.arrivals) < 7
 
 
 def test_a_method_that_is_not_made_for_a_scenario_takes_no_part() -> None:
