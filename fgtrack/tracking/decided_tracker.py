@@ -184,7 +184,11 @@ class DecidedTracker(MultiObjectTracker):
         if self._objects is not None:
             self._objects.settle(oldest_ns)
         _settle(settled, self._final, self._ended)
-        self._tracks.end(self._lives.ended_before(oldest_ns))
+        for bank_id in self._lives.ended_before(oldest_ns):
+            if self._is_single(bank_id):
+                self._tracks.drop(bank_id)
+            else:
+                self._tracks.end([bank_id])
         self._unposed = [each for each in self._unposed if each.stamp_ns >= oldest_ns]
 
     def _keep_firsts(self, entry: Entry, publics: Sequence[int | None]) -> None:
@@ -585,6 +589,7 @@ class DecidedTracker(MultiObjectTracker):
         if not self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
             return False
         self._tracks.num_measured[bank_id] -= 1
+        self._lives.doubt(bank_id)
         return True
 
     def _birth(self, place: _Place, is_again: bool) -> None:
@@ -714,13 +719,16 @@ class DecidedTracker(MultiObjectTracker):
         for bank_id in self._parts.bank.track_ids:
             if bank_id in living or self._lives.is_suspended(bank_id):
                 continue
-            known = self._lives.lives.get(bank_id)
-            was_confirmed = known is not None and known.is_confirmed
-            is_single = self._tracks.num_measured[bank_id] < 2
-            if is_single and not was_confirmed and self._began_inside(bank_id):
+            if self._is_single(bank_id) and self._began_inside(bank_id):
                 self._tracks.drop(bank_id)
             else:
                 self._lives.suspend(bank_id, step.stamp_ns)
+        self._tracks.withheld = set(filter(self._is_single, self._parts.bank.track_ids))
+
+    def _is_single(self, bank_id: int) -> bool:
+        """True for a track with one detection that was not confirmed."""
+        is_single = self._tracks.num_measured[bank_id] < 2
+        return is_single and not self._lives.was_confirmed(bank_id)
 
     def _began_inside(self, bank_id: int) -> bool:
         """True for a track whose first detection is not decided for good."""

@@ -30,6 +30,7 @@ class Tracks(Stateful):
         "_public",
         "_bank_ids",
         "_dropped",
+        "withheld",
     )
 
     def __init__(self, parts: TrackerParts) -> None:
@@ -48,6 +49,8 @@ class Tracks(Stateful):
         self._bank_ids: dict[int, int] = {}
         # Tracks whose last smoothed states are not to be published.
         self._dropped: set[int] = set()
+        self.withheld: set[int] = set()
+        """Tracks without final states, as they have one detection and are not confirmed."""
 
     def name(self, bank_id: int, public: int) -> None:
         """Publish the track `bank_id` of the bank as `public`."""
@@ -75,6 +78,7 @@ class Tracks(Stateful):
             replace(each, track_id=self.public(each.track_id))
             for each in reports
             if each.track_id not in self._dropped
+            and (each.lag_s is not None or each.track_id not in self.withheld)
         ]
         self._dropped = set()
         return kept

@@ -41,7 +41,13 @@ class Life:
 class DecidedLives(Stateful):
     """Lives of the tracks according to the decisions; see `fgtrack.tracking.lives.existence` for the other methods."""
 
-    STATE: ClassVar[tuple[str, ...]] = ("lives", "_present_ns", "_known_ns", "_ended")
+    STATE: ClassVar[tuple[str, ...]] = (
+        "lives",
+        "_present_ns",
+        "_known_ns",
+        "_ended",
+        "_confirmed",
+    )
 
     birth_probability = 0.5
 
@@ -49,6 +55,8 @@ class DecidedLives(Stateful):
         self._rules = rules
         self.lives: dict[int, Life] = {}
         """By track."""
+        self._confirmed = set[int]()
+        """Tracks that were confirmed when their life was last known."""
         self._ended: dict[int, int] = {}
         """Tracks that have ended, and may come back by a late list."""
         self._present_ns = self._known_ns = 0
@@ -61,7 +69,19 @@ class DecidedLives(Stateful):
     def live(self, track_id: int, life: Life) -> None:
         """Note the life of a track."""
         self.lives[track_id] = life
+        if life.is_confirmed:
+            self._confirmed.add(track_id)
+        else:
+            self._confirmed.discard(track_id)
         self._ended.pop(track_id, None)
+
+    def was_confirmed(self, track_id: int) -> bool:
+        """True for a track that was confirmed when its life was last known."""
+        return track_id in self._confirmed
+
+    def doubt(self, track_id: int) -> None:
+        """Note that a track has lost a detection, so an earlier confirmation does not count."""
+        self._confirmed.discard(track_id)
 
     def is_suspended(self, track_id: int) -> bool:
         """True for a track that has ended, and may come back."""
@@ -117,6 +137,7 @@ class DecidedLives(Stateful):
         """Forget a track."""
         self.lives.pop(track_id, None)
         self._ended.pop(track_id, None)
+        self._confirmed.discard(track_id)
 
     def reported(
         self, track_ids: Sequence[int]
