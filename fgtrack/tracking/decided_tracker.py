@@ -693,7 +693,7 @@ class DecidedTracker(MultiObjectTracker):
             return
         best, nodes = step.hypotheses[0], step.nodes
         matched = set(best.taken)
-        exists = nodes.existed * nodes.alive * nodes.own
+        exists = nodes.present
         living = set[int]()
         for root, probability, hazard_hz, is_confirmed in zip(
             nodes.roots[best.rows].tolist(),

@@ -1,7 +1,7 @@
 """The table of log-likelihoods of a list: each candidate with each track, as clutter, and as a new object."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from fgtrack.tracking.objects import differ
 
 _GATE_PROBABILITY = 0.99999
 _LEAST_GAIN = -LARGEST_LOSS
+_LARGEST_LOG_RATIO = 500.0
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Table:
     """Probability that each track is detected, if it exists, shape (n,)."""
     in_view: BoolArray
     """True for each track that the list would show, shape (n,)."""
+    ratios: Mapping[tuple[int, int], float]
+    """Likelihood ratio of each pair (track, candidate), if the track is detected, to a candidate without a track."""
     jumps: set[tuple[int, int]]
     """Pairs (track, candidate) whose correlated error is probably new."""
 
@@ -58,14 +61,15 @@ def likelihoods(
     log_free, born = _free(entry, unseen, returns, rules)
     rows, columns, log_densities, jumps = _pairs(nodes, entry)
     more = _described(nodes, entry, rows, columns)
+    log_ratios = log_densities + more - log_free[columns]
     gains = (
         np.log(np.maximum(now * detectable, 1e-300))[rows]
         - np.log(missed)[rows]
-        + log_densities
-        + more
-        - log_free[columns]
+        + log_ratios
     )
     likely = gains > _LEAST_GAIN
+    pairs = zip(rows[likely].tolist(), columns[likely].tolist(), strict=True)
+    ratios = np.exp(np.minimum(log_ratios[likely], _LARGEST_LOG_RATIO)).tolist()
     return Table(
         Gains.of(
             rows[likely],
@@ -78,6 +82,7 @@ def likelihoods(
         born,
         detectable,
         in_view & misses,
+        dict(zip(pairs, ratios, strict=True)),
         set(zip(rows[jumps].tolist(), columns[jumps].tolist(), strict=True)),
     )
 

@@ -22,6 +22,8 @@ class Nodes:
     covariances: FloatArray
     existed: FloatArray
     """Probability that the object has ever existed."""
+    believed: FloatArray
+    """Probability that the object has ever existed, if the detections of the track may also be clutter."""
     alive: FloatArray
     """Probability that the object still exists, if it has ever existed."""
     visible: FloatArray
@@ -46,12 +48,18 @@ class Nodes:
     """Probability that the track is no second return of another track."""
     descriptions: tuple[Description, ...]
 
+    @property
+    def present(self) -> FloatArray:
+        """Probability that each track is an object of its own that exists now, shape (n,)."""
+        return np.asarray(self.believed * self.alive * self.own)
+
     def at(self, rows: IntArray) -> "Nodes":
         """Return the tracks in `rows`."""
         return Nodes(
             self.means.take(rows, axis=0),
             self.covariances.take(rows, axis=0),
             self.existed.take(rows),
+            self.believed.take(rows),
             self.alive.take(rows),
             self.visible.take(rows, axis=0),
             self.is_confirmed.take(rows),
@@ -110,6 +118,7 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
     nodes = Nodes(
         np.zeros((0, n)),
         np.zeros((0, n, n)),
+        np.zeros(0),
         np.zeros(0),
         np.zeros(0),
         np.zeros((0, num_sensors)),

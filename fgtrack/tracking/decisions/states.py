@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgtrack.core.linalg import kernels
-from fgtrack.core.types import BoolArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.likelihoods import Table
 from fgtrack.tracking.decisions.measurements import correct, renewed, split
@@ -52,6 +52,7 @@ def started(
     return Nodes(
         means,
         P,
+        table.born[list(columns)],
         table.born[list(columns)],
         np.ones(n),
         visible,
@@ -109,6 +110,7 @@ def updated(
     alive = np.where(placed, 1.0, nodes.alive * (1.0 - missable) / unseen_alive)
     existed = np.where(hit & ~placed, nodes.existed, existed)
     alive = np.where(hit & ~placed, nodes.alive, alive)
+    believed = _believed(nodes, rows, columns, table, detectable, missable, placed)
     visible = nodes.visible.copy()
     own_visible = visible[:, entry.index]
     P_D = entry.sensor.detection_probability
@@ -131,6 +133,7 @@ def updated(
         means=means,
         covariances=P,
         existed=existed,
+        believed=np.where(hit & ~placed, nodes.believed, believed),
         alive=alive,
         visible=visible,
         has_travelled=travelled,
@@ -141,13 +144,42 @@ def updated(
     )
 
 
+def _believed(
+    nodes: Nodes,
+    rows: IntArray,
+    columns: IntArray,
+    table: Table,
+    detectable: FloatArray,
+    missable: FloatArray,
+    placed: BoolArray,
+) -> FloatArray:
+    """Return the probabilities that the objects of tracks have ever existed, if a detection may also be clutter.
+
+    The few hypotheses that are kept do not show each detection as clutter. So the alternative of a track with a
+    detection is the same track without one.
+    """
+    exists = nodes.believed * nodes.alive
+    missed = 1.0 - exists * missable
+    if_missed = nodes.believed * (1.0 - nodes.alive * missable) / missed
+    ratios = np.array(
+        [
+            table.ratios.get((row, column), 0.0) if is_placed else 0.0
+            for row, column, is_placed in zip(
+                rows.tolist(), columns.tolist(), placed.tolist(), strict=True
+            )
+        ]
+    )
+    odds = exists * detectable * ratios / missed
+    return np.asarray((odds + if_missed) / (odds + 1.0))
+
+
 def judged(nodes: Nodes, rows: IntArray, entry: Entry, rules: Rules) -> Nodes:
     """Return the tracks with their confirmation, and with the rate at which their existence decays from now on.
 
     `rows` are the tracks of the best hypothesis, of which other tracks may be second returns.
     """
     own = own_probabilities(nodes, rows, rules.returns, rules.speed_std_mps)
-    exists = nodes.existed * nodes.alive * own
+    exists = nodes.believed * nodes.alive * own
     confirmed = nodes.is_confirmed | (
         nodes.has_travelled & (exists >= rules.confirm_probability)
     )
