@@ -361,7 +361,7 @@ def test_a_sensor_without_a_model_has_assumed_noise(call: Call) -> None:
     )
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
-    assert "assumed, radar: standard deviations x_m 1, y_m 1" in text
+    assert "assumed, radar: standard deviations x_m 1, y_m 0.91 (scatter of 142" in text
     assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
 
 

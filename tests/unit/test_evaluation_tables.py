@@ -175,6 +175,10 @@ def test_markdown_and_latex_have_a_cell_for_every_column(
 ) -> None:
     table = tables.tables[name].in_full()
     lines = [line for line in table.to_markdown().splitlines() if line.startswith("|")]
+    if not table.records:  # runs without detections have no decisions
+        assert name == "decisions"
+        assert len(lines) == 2
+        return
     head, _, *rows = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in lines
     ]
