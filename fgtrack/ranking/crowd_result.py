@@ -13,7 +13,7 @@ from fgtrack.evaluation.scores.multi_object import multi_object_metrics
 from fgtrack.evaluation.scores.t_gospa import t_gospa
 from fgtrack.evaluation.tables import Column, Table
 from fgtrack.ranking.crowds import CROWD_LAGS_S, CROWDS, CrowdProblem, Positions
-from fgtrack.ranking.ranks import interval, ranked
+from fgtrack.ranking.ranks import WithInterval, interval, positive, ranked
 
 _PARTS = ("localisation_m2", "missed_m2", "false_m2", "switches_m2")
 _MS = 1e3
@@ -95,6 +95,11 @@ class CrowdResult:
         return self.t_gospa_m[:, 0]
 
     @property
+    def is_complete(self) -> bool:
+        """True if the method has tracks; no track is an answer, too."""
+        return self.problem is None
+
+    @property
     def sentence(self) -> str:
         """Errors of the tracks in words."""
         if not self.takes_part:
@@ -107,7 +112,7 @@ class CrowdResult:
         parts = ", ".join(
             f"{name} {share:.0f} %" for name, share in zip(names, shares, strict=True)
         )
-        now, past = average(self.error), average(self.t_gospa_m[:, 1]).mean
+        now, past = positive(self.error), average(self.t_gospa_m[:, 1]).mean
         return (
             f"{self.scenario}: T-GOSPA {f'{now:.3g}' if now.is_known else f'{now.mean:.3g}'} m now, "
             f"{past:.3g} m 1 s ago; "
@@ -162,7 +167,7 @@ def _record(result: CrowdResult) -> dict[str, object]:
     parts = dict(zip(_PARTS, result.parts_m2.mean(axis=0).tolist(), strict=True))
     return {
         "method": result.method,
-        **interval("t_gospa", average(result.error), "_m"),
+        **interval("t_gospa", positive(result.error), "_m"),
         "t_gospa_past_m": average(result.t_gospa_m[:, 1]).mean,
         **parts,
         **interval("idf1", average(result.idf1), ""),
@@ -174,7 +179,7 @@ def _record(result: CrowdResult) -> dict[str, object]:
 _COLUMNS = (
     Column("method", left=True),
     Column("rank"),
-    Column(
+    WithInterval(
         "T-GOSPA now\n[m]", "t_gospa_m t_gospa_low_m t_gospa_high_m", "{} ({} to {})"
     ),
     Column("1 s ago\n[m]", "t_gospa_past_m"),
@@ -182,7 +187,7 @@ _COLUMNS = (
     Column("missed\n[m2]", "missed_m2"),
     Column("false\n[m2]", "false_m2"),
     Column("switches\n[m2]", "switches_m2"),
-    Column("IDF1", "idf1 idf1_low idf1_high", "{} ({} to {})"),
+    WithInterval("IDF1", "idf1 idf1_low idf1_high", "{} ({} to {})"),
     Column("switches\na run", "switches"),
     Column("time\n[ms]", "seconds", scale=_MS),
 )

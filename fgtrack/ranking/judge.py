@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgtrack.core.errors import CallError
+from fgtrack.core.types import IntArray
 from fgtrack.ranking.crowd_result import CrowdResult
 from fgtrack.ranking.crowds import CROWDS, CrowdProblem
 from fgtrack.ranking.methods import Answers, Method, MethodError
@@ -98,9 +99,7 @@ def _judged(method: Method, scenario: str, problems: Sequence[Problem]) -> Resul
         return Result.without_answers(
             method.name, scenario, str(error) or "not implemented", takes_part=False
         )
-    refused: Counter[str] = Counter()
-    for each in found:
-        refused.update(each.refused)
+    reported = [each.refused for each in found if each.refused is not None]
     pairs = list(zip(problems, found, strict=True))
     return Result(
         method.name,
@@ -109,11 +108,40 @@ def _judged(method: Method, scenario: str, problems: Sequence[Problem]) -> Resul
         np.array([_deviations(*pair) for pair in pairs]),
         np.array([_nees(*pair) for pair in pairs]),
         order,
-        refused,
+        sum(map(Counter, reported), Counter()) if reported else None,
         float(np.median([own.seconds / len(one.arrivals) for one, own in pairs])),
         peak_bytes,
         sum(_is_indefinite(answer) for each in found for answer in each.answers),
+        _answered(pairs),
+        float(np.max([_covariance_deviation(*pair) for pair in pairs])),
     )
+
+
+def _answered(pairs: Sequence[tuple[Problem, Answers]]) -> IntArray:
+    """Return the numbers of answers and of queries by lag, shape (lags, 2)."""
+    numbers = np.zeros((len(LAGS_S), 2), dtype=np.int64)
+    for problem, found in pairs:
+        for query, answer in zip(problem.queries, found.answers, strict=True):
+            numbers[LAGS_S.index(query.lag_s)] += (answer is not None, 1)
+    return numbers
+
+
+def _covariance_deviation(problem: Problem, found: Answers) -> float:
+    """Largest difference of the present covariances from the exact ones, relative to their variances.
+
+    NaN if a covariance is missing.
+    """
+
+    def one(answer: Answer, number: int) -> float:
+        exact = problem.exact[number].covariance
+        assert exact is not None
+        if answer.covariance is None:
+            return math.nan
+        stds = np.sqrt(np.diag(exact))
+        return float(np.abs((answer.covariance - exact) / np.outer(stds, stds)).max())
+
+    values = _by_lag(problem, found, one)[0]
+    return float(np.max(values)) if values else math.nan
 
 
 def _is_indefinite(answer: Answer | None) -> bool:
@@ -136,7 +164,7 @@ def _peak_bytes(method: Method, problem: Problem) -> float:
 
 
 def _errors(problem: Problem, found: Answers) -> list[float]:
-    """Root mean square position error at each lag; NaN where an answer is missing."""
+    """Root mean square position error of the answers at each lag; NaN without answers."""
     return [
         math.sqrt(_mean(squares))
         for squares in _by_lag(
@@ -153,9 +181,9 @@ def _errors(problem: Problem, found: Answers) -> list[float]:
 
 
 def _deviations(problem: Problem, found: Answers) -> list[float]:
-    """Largest deviation from the exact estimate at each lag; NaN where an answer is missing."""
+    """Largest deviation of the answers from the exact estimate at each lag; NaN without answers."""
     return [
-        max(values, default=math.nan) if not any(map(math.isnan, values)) else math.nan
+        max(values, default=math.nan)
         for values in _by_lag(
             problem,
             found,
@@ -165,7 +193,7 @@ def _deviations(problem: Problem, found: Answers) -> list[float]:
 
 
 def _nees(problem: Problem, found: Answers) -> float:
-    """Mean NEES of the present state; NaN without covariances, or if a covariance is not positive definite."""
+    """Mean NEES of the present answers; NaN without covariances, or if a covariance is not positive definite."""
 
     def one(answer: Answer, number: int) -> float:
         if answer.covariance is None or _is_indefinite(answer):
@@ -179,14 +207,13 @@ def _nees(problem: Problem, found: Answers) -> float:
 def _by_lag(
     problem: Problem, found: Answers, value: Callable[[Answer, int], float]
 ) -> list[list[float]]:
-    """Return the values of the answers at each lag; NaN for a missing answer."""
+    """Return the values of the answers at each lag."""
     result: list[list[float]] = [[] for _ in LAGS_S]
     for number, (query, answer) in enumerate(
         zip(problem.queries, found.answers, strict=True)
     ):
-        result[LAGS_S.index(query.lag_s)].append(
-            math.nan if answer is None else value(answer, number)
-        )
+        if answer is not None:
+            result[LAGS_S.index(query.lag_s)].append(value(answer, number))
     return result
 
 

@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -50,8 +50,8 @@ class Answers:
     """Answer of each query; None where the method gives none."""
     seconds: float
     """Processor time, for a program the time on the clock."""
-    refused: Mapping[str, int] = field(default_factory=dict)
-    """Number of measurements that were not fused, by reason; programs do not report it."""
+    refused: Mapping[str, int] | None = None
+    """Number of measurements that were not fused, by reason; None if the method does not report it."""
 
 
 @dataclass(frozen=True)

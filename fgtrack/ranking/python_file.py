@@ -145,7 +145,7 @@ class PythonMethod(Method):
         return Answers(
             tuple(_checked(each) for each in raw),
             time.process_time() - started_s,
-            refused,
+            refused if self._is_class else None,
         )
 
     def check_causality_of_tracks(self, problem: CrowdProblem) -> None:

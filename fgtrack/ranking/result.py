@@ -1,17 +1,17 @@
 """Results of methods: measures, sentences, ranks and tables."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.ranking.crowd_result import CrowdResult, crowd_table
 from fgtrack.ranking.problem import LAGS_S
-from fgtrack.ranking.ranks import interval, ranked
+from fgtrack.ranking.ranks import WithInterval, interval, positive, ranked
 from fgtrack.ranking.scenarios import SCENARIOS
 
 EXACT = 1e-6
@@ -35,14 +35,20 @@ class Result:
     """Mean NEES of the present x, y, vx, vy by run, shape (runs,); NaN without covariances."""
     order: float
     """Largest change of the last answers, in standard deviations, if the arrivals come in another order."""
-    refused: Mapping[str, int]
-    """Number of measurements that were not fused, by reason."""
+    refused: Mapping[str, int] | None
+    """Number of measurements that were not fused, by reason; None if the method does not report it."""
     seconds: float
     """Time for one measurement."""
     peak_bytes: float = math.nan
     """Largest memory of Python and NumPy during a run; NaN for a program."""
     num_indefinite: int = 0
     """Number of answers whose covariance is not positive definite."""
+    answered: IntArray = field(
+        default_factory=lambda: np.zeros((len(LAGS_S), 2), dtype=np.int64)
+    )
+    """Numbers of answers and of queries by lag over the runs, shape (lags, 2)."""
+    covariance_deviation: float = math.nan
+    """Largest difference of the present covariances from the exact ones, relative to the variances; NaN if unknown."""
     problem: str | None = None
     """Reason why the method has no answers; None if it has."""
     takes_part: bool = True
@@ -61,7 +67,7 @@ class Result:
             empty,
             np.zeros(0),
             math.nan,
-            {},
+            None,
             math.nan,
             problem=problem,
             takes_part=takes_part,
@@ -74,8 +80,25 @@ class Result:
 
     @property
     def deviation(self) -> float:
-        """Largest deviation of the present estimate over the runs."""
-        return float(self.deviations[:, 0].max()) if len(self.deviations) else math.nan
+        """Largest deviation of the present estimate over the runs; NaN without answers."""
+        return self.farthest[0]
+
+    @property
+    def farthest(self) -> list[float]:
+        """Largest deviation over the runs at each lag; NaN without answers."""
+        columns = [column[~np.isnan(column)] for column in self.deviations.T]
+        return [float(column.max()) if len(column) else math.nan for column in columns]
+
+    @property
+    def is_complete(self) -> bool:
+        """True if the method has answered all queries for the present."""
+        answers, queries = self.answered[0].tolist()
+        return self.problem is None and answers == queries
+
+    @property
+    def is_exact(self) -> bool:
+        """True if mean and covariance of the present equal the exact estimate."""
+        return self.deviation < EXACT and self.covariance_deviation < EXACT
 
     @property
     def sentence(self) -> str:
@@ -85,9 +108,9 @@ class Result:
         if self.problem is not None:
             return f"{self.scenario}: no result: {self.problem}"
         parts = [
-            _departure(lag_s, value)
-            for lag_s, value in zip(
-                LAGS_S, self.deviations.max(axis=0).tolist(), strict=True
+            _departure(lag_s, value, *counts)
+            for lag_s, value, counts in zip(
+                LAGS_S, self.farthest, self.answered.tolist(), strict=True
             )
         ]
         if self.order < EXACT:
@@ -96,15 +119,7 @@ class Result:
             parts.append(
                 f"another order of arrival changes an estimate by {self.order:.2g} standard deviations"
             )
-        anees = average(self.nees)
-        if anees.is_known and anees.low > _NUM_STATES:
-            parts.append(
-                f"its covariance is too small: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
-            )
-        elif anees.is_known and anees.high < _NUM_STATES:
-            parts.append(
-                f"its covariance is too large: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
-            )
+        parts += self._on_covariances()
         if self.num_indefinite:
             parts.append(
                 f"covariances that are not positive definite: {self.num_indefinite}"
@@ -116,15 +131,36 @@ class Result:
             )
         return f"{self.scenario}: {'; '.join(parts)}"
 
+    def _on_covariances(self) -> list[str]:
+        """Return in words whether the covariance is too small or too large; nothing for an exact estimate."""
+        anees = positive(self.nees)
+        if self.is_exact or not anees.is_known:
+            return []
+        if anees.low <= _NUM_STATES <= anees.high:
+            return []
+        size = "small" if anees.low > _NUM_STATES else "large"
+        return [
+            f"its covariance is too {size}: ANEES {anees.mean:.2g} instead of {_NUM_STATES}"
+        ]
 
-def _departure(lag_s: float, deviation: float) -> str:
-    """Return the departure from the exact estimate at a lag in words."""
+
+def _departure(
+    lag_s: float, deviation: float, num_answers: int, num_queries: int
+) -> str:
+    """Return the departure from the exact estimate at a lag in words, with the number of missing answers."""
     name = f"estimate {lag_s:g} s ago" if lag_s else "present estimate"
-    if math.isnan(deviation):
+    if not num_answers:
         return f"there is no {name}"
+    missing = ""
+    if num_answers < num_queries:
+        names = name.replace("estimate", "estimates")
+        verb = "is" if num_queries - num_answers == 1 else "are"
+        missing = (
+            f"{num_queries - num_answers} of {num_queries} {names} {verb} missing; "
+        )
     if deviation < EXACT:
-        return f"the {name} is exact"
-    return f"the {name} departs by up to {deviation:.2g} standard deviations"
+        return f"{missing}the {name} is exact"
+    return f"{missing}the {name} departs by up to {deviation:.2g} standard deviations"
 
 
 @dataclass(frozen=True)
@@ -163,7 +199,7 @@ class Ranking:
         ]
         if not own:
             return "there are no answers about one object"
-        exact = [each for each in own if each.deviation < EXACT]
+        exact = [each for each in own if each.is_complete and each.deviation < EXACT]
         text = f"the present estimate is exact in {len(exact)} of {len(own)} scenarios of one object"
         farthest = max(own, key=lambda each: np.nan_to_num(each.deviation, nan=-1.0))
         if farthest.deviation >= EXACT:
@@ -211,7 +247,8 @@ class Ranking:
         records = [{**_record(each), "rank": rank} for each, rank in ranked(results)]
         notes = [
             f"{SCENARIOS[scenario].about}; {self.num_runs} runs; brackets: 95 % intervals over the runs",
-            "rank: methods whose error now does not differ significantly from the best one of the rank share it",
+            "rank: methods whose error now does not differ significantly from the best one of the rank share it; "
+            "a dash: present answers are missing",
             "deviation: largest deviation of x, y, vx, vy from the exact joint estimate, in its standard deviations",
             f"ANEES: {_NUM_STATES} for a covariance that is right; order: largest change by another order of arrival",
             "time: processor time for a measurement; memory: peak of Python and NumPy during a run",
@@ -222,7 +259,7 @@ class Ranking:
 _COLUMNS = (
     Column("method", left=True),
     Column("rank"),
-    Column("error now\n[m]", "error_m error_low_m error_high_m", "{} ({} to {})"),
+    WithInterval("error now\n[m]", "error_m error_low_m error_high_m", "{} ({} to {})"),
     *(
         Column(f"error {lag_s:g} s\nago [m]", f"error_{k}_m")
         for k, lag_s in enumerate(LAGS_S)
@@ -236,7 +273,7 @@ _COLUMNS = (
         for k, lag_s in enumerate(LAGS_S)
         if k
     ),
-    Column("ANEES", "anees anees_low anees_high", "{} ({} to {})"),
+    WithInterval("ANEES", "anees anees_low anees_high", "{} ({} to {})"),
     Column("order", text=lambda value: _scientific(value)),
     Column("not\nfused", "refused"),
     Column("time\n[us]", "seconds", scale=_US),
@@ -247,19 +284,19 @@ _COLUMNS = (
 def _record(result: Result) -> dict[str, object]:
     if result.problem is not None:
         return {"method": result.method, "problem": result.problem}
-    now, anees = average(result.rmse_m[:, 0]), average(result.nees)
+    now, anees = positive(result.rmse_m[:, 0]), positive(result.nees)
     record: dict[str, object] = {
         "method": result.method,
         **interval("error", now, "_m"),
         **interval("anees", anees, ""),
         "order": result.order,
-        "refused": sum(result.refused.values()),
+        "refused": None if result.refused is None else sum(result.refused.values()),
         "seconds": result.seconds,
         "peak_bytes": result.peak_bytes,
     }
     for k, _ in enumerate(LAGS_S):
-        record[f"error_{k}_m"] = _mean(result.rmse_m[:, k].tolist())
-        record[f"deviation_{k}"] = float(result.deviations[:, k].max())
+        record[f"error_{k}_m"] = average(result.rmse_m[:, k]).mean
+        record[f"deviation_{k}"] = result.farthest[k]
     return record
 
 
@@ -278,7 +315,3 @@ def _scientific(value: str | int | float) -> str:
     if not isinstance(value, float) or not math.isfinite(value):
         return "-"
     return "0" if not value else f"{value:.1e}" if value < 0.01 else f"{value:.2g}"
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else math.nan

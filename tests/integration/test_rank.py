@@ -5,6 +5,7 @@ import math
 import os
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from fgtrack.ranking.methods import Answers, Shipped
 from fgtrack.ranking.problem import LAGS_S, Arrival, Problem
 from fgtrack.ranking.public import MethodLike, method
 from fgtrack.ranking.public import rank as ranked
-from fgtrack.ranking.result import EXACT, Result
+from fgtrack.ranking.ranks import positive
+from fgtrack.ranking.result import EXACT, Ranking, Result
 from fgtrack.ranking.scenarios import SCENARIOS, draw
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -547,6 +549,89 @@ def test_a_pair_may_be_a_list_and_a_mean_a_tuple() -> None:
     assert rank(Constant).problem is None
 
 
+def answering(answers: Callable[[int], Any]) -> type:
+    """Return a class whose answer number k is `answers(k)`."""
+
+    class Answering:
+        def __init__(self, given: Any) -> None:
+            self.count = 0
+
+        def update(self, observation: Any) -> None: ...
+
+        def state_at(self, time_s: float) -> Any:
+            self.count += 1
+            return answers(self.count - 1)
+
+    return Answering
+
+
+def test_a_method_that_answers_nothing_has_no_rank_and_stands_last() -> None:
+    none = answering(lambda number: None)
+    found = ranked([none, "drop"], ["linear"], num_runs=3)
+    records = found._table("linear").records
+    assert [record["method"] for record in records] == ["drop", "Answering"]
+    assert [record["rank"] for record in records] == [1, None]
+    assert "there is no present estimate; there is no" in found.results[0].sentence
+
+
+def test_missing_answers_are_counted_and_the_others_are_judged() -> None:
+    far = answering(lambda number: None if number == 0 else np.zeros(4))
+    found = ranked([far, "drop"], ["linear"], num_runs=3)
+    result = found.results[0]
+    assert isinstance(result, Result)
+    count = int(result.answered[0, 1])
+    assert f"3 of {count} present estimates are missing; the present" in result.sentence
+    last = found._table("linear").records[1]
+    assert last["rank"] is None
+    assert last["error_m"] > 10.0
+    assert last["error_1_m"] > 10.0
+    assert last["deviation_0"] > 10.0
+
+
+class FirstMissing(Shipped):
+    """A shipped estimator without an answer to the first query."""
+
+    def answers(self, problem: Problem) -> Answers:
+        found = super().answers(problem)
+        return replace(found, answers=(None, *found.answers[1:]))
+
+
+def test_a_single_missing_answer_is_named() -> None:
+    (result,) = judge([FirstMissing("ekf-replay")], ["linear"], 1, 1).results
+    assert isinstance(result, Result)
+    count = int(result.answered[0, 1])
+    assert (
+        f"linear: 1 of {count} present estimates is missing; the present estimate is exact"
+        in result.sentence
+    )
+    found = Ranking((result,), 1)
+    assert "exact in 0 of 1" in found.summary("ekf-replay")
+
+
+def test_what_a_function_does_not_fuse_is_not_known(tmp_path: Path) -> None:
+    found = ranked([written(tmp_path / "f.py", SORTED + FUSE)], ["linear"], num_runs=2)
+    assert found._table("linear").records[0]["refused"] is None
+    assert "measurements not fused" not in found.results[0].sentence
+
+
+def test_intervals_of_errors_are_positive_and_need_three_runs() -> None:
+    three = positive(np.array([0.1, 0.1, 2.0]))
+    assert 0.0 < three.low < three.mean < three.high
+    assert not positive(np.array([0.1, 2.0])).is_known
+    assert positive(np.full(4, 0.5)).low == pytest.approx(0.5)
+    text = str(ranked(["drop"], ["linear"], num_runs=2))
+    assert "(- to -)" not in text
+    assert " to " not in text.split("brackets")[0]
+
+
+def test_a_covariance_is_not_called_wrong_where_the_estimate_is_exact() -> None:
+    result = rank("ekf-replay", num_runs=3)
+    wrong = replace(result, nees=np.array([9.0, 9.1, 9.2]))
+    assert "covariance" not in wrong.sentence
+    too_small = replace(wrong, covariance_deviation=0.1)
+    assert "its covariance is too small: ANEES 9.1 instead of 4" in too_small.sentence
+
+
 def test_two_methods_with_one_name_are_refused() -> None:
     with pytest.raises(CallError, match="2 methods are called drop"):
         ranked(["drop", "drop"], ["linear"])
@@ -599,7 +684,7 @@ def test_the_command_prints_tables_and_writes_a_page_for_each_method(
     tmp_path: Path,
 ) -> None:
     out = tmp_path / "out"
-    words = ["rank", "ekf-replay", "drop", "--scenario", "late-by-10", "--runs", "2"]
+    words = ["rank", "ekf-replay", "drop", "--scenario", "late-by-10", "--runs", "3"]
     done = CliRunner().invoke(app, [*words, "-o", str(out)])
     assert done.exit_code == 0, done.output
     assert "the present estimate is exact" in done.output
@@ -613,7 +698,7 @@ def test_the_command_prints_tables_and_writes_a_page_for_each_method(
     assert "not fused" in (out / "drop.md").read_text()
     for name in ("ranking.md", "ranking.tex"):
         text = (out / name).read_text(encoding="utf-8")
-        assert len(re.findall(r"[\d.]+ \(-?[\d.]+ to [\d.]+\)", text)) == 2 * 2
+        assert len(re.findall(r"[\d.]+ \([\d.]+ to [\d.]+\)", text)) == 2 * 2
 
 
 def test_the_page_lists_every_scenario() -> None:
