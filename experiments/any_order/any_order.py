@@ -23,8 +23,7 @@ from outputs import final_states, outputs, scores, share
 
 import fgtrack
 from fgtrack import Config, DetectionList, Message, TruthState, open_input
-from fgtrack.evaluation.scores.revisions import revision_metrics
-from fgtrack.evaluation.settings import evaluation_settings
+from fgtrack.evaluation import evaluation_settings, revision_metrics
 from fgtrack.sim import ConstantDelay, SensorDelays, redelay
 
 IN_ORDER = "in order"

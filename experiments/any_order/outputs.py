@@ -6,8 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack import NS_PER_S, FloatArray, IntArray, Run
-from fgtrack.evaluation import Columns, clear, match, scenes, t_gospa
-from fgtrack.evaluation.settings import evaluation_settings
+from fgtrack.evaluation import (
+    Columns,
+    clear,
+    evaluation_settings,
+    match,
+    scenes,
+    t_gospa,
+)
 
 PRESENT, FINAL = "present", "final"
 NEAR_M = 0.05

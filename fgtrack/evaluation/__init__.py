@@ -25,6 +25,7 @@ _HOMES = {
     "NO_TRACK": "fgtrack.runs",
     "PREDICTION_STEP_S": "fgtrack.evaluation.scores.prediction",
     "RUN": "fgtrack.evaluation.tables",
+    "RevisionMetrics": "fgtrack.evaluation.scores.revisions",
     "Scenes": "fgtrack.evaluation.near_pairs",
     "Statistic": "fgtrack.evaluation.intervals",
     "Table": "fgtrack.evaluation.tables",
@@ -48,6 +49,7 @@ _HOMES = {
     "named": "fgtrack.evaluation.tables",
     "paired": "fgtrack.evaluation.intervals",
     "position_nees": "fgtrack.evaluation.matching",
+    "revision_metrics": "fgtrack.evaluation.scores.revisions",
     "scenes": "fgtrack.evaluation.matching",
     "short": "fgtrack.evaluation.tables",
     "true_paths": "fgtrack.evaluation.truth",
@@ -88,6 +90,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     )
     from fgtrack.evaluation.scores.prediction import displacements as displacements
     from fgtrack.evaluation.scores.registry import Metric as Metric
+    from fgtrack.evaluation.scores.revisions import RevisionMetrics as RevisionMetrics
+    from fgtrack.evaluation.scores.revisions import revision_metrics as revision_metrics
     from fgtrack.evaluation.scores.statistics import Distribution as Distribution
     from fgtrack.evaluation.scores.statistics import Moments as Moments
     from fgtrack.evaluation.scores.t_gospa import t_gospa as t_gospa

@@ -41,6 +41,7 @@ PRIVATE = {
     "experiments/advise/noise_intervals.py": "evaluates the likelihood of the noise itself",
     "experiments/real_delays/real_delays.py": "reads the tracker between the ticks of a replay",
     "experiments/bench_banks.py": "times a bank without a tracker",
+    "experiments/bench_deadlines.py": "times the tracker without the replay around it",
     "experiments/bench_memory.py": "measures memory inside a replay",
     "experiments/bench_soak.py": "hashes the rows of a run that is never stored",
     "experiments/bench_tracker.py": "times the tracker without the replay around it",
