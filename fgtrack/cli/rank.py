@@ -14,6 +14,7 @@ from fgtrack.ranking.crowd_files import write_crowd, write_crowd_truth
 from fgtrack.ranking.crowds import CROWDS
 from fgtrack.ranking.files import write_exact, write_problem
 from fgtrack.ranking.judge import judge
+from fgtrack.ranking.methods import TIME_LIMIT_S
 from fgtrack.ranking.public import method
 from fgtrack.ranking.result import Ranking
 from fgtrack.ranking.scenarios import SCENARIOS, draw
@@ -37,6 +38,15 @@ def rank(
     ] = None,
     runs: Annotated[int, Option(min=2, help="Number of runs of each scenario.")] = 10,
     seed: Seed = 1,
+    time_limit_s: Annotated[
+        float,
+        Option(
+            "--time-limit",
+            min=0.001,
+            metavar="S",
+            help="Longest time of a run of a program in s.",
+        ),
+    ] = TIME_LIMIT_S,
     form: FormOption = None,
     out: Annotated[
         Path | None,
@@ -57,7 +67,7 @@ def rank(
     names = list(dict.fromkeys(scenarios or SCENARIOS))
     if not methods and export is None:
         raise CallError("give at least one METHOD, or --export FOLDER")
-    chosen = [method(text) for text in methods or ()]
+    chosen = [method(text, time_limit_s) for text in methods or ()]
     for path in _outputs(out, [each.name for each in chosen]):
         check_output(path, overwrite)
     if export is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.ranking.crowds import CrowdProblem, Positions
-from fgtrack.ranking.files import MEASUREMENTS, decimal, finite_number
+from fgtrack.ranking.files import MEASUREMENTS, decimal, finite_number, require_columns
 
 _VEHICLE = ("vehicle_x_m", "vehicle_y_m", "vehicle_yaw_rad")
 _COLUMNS = (
@@ -18,6 +18,7 @@ _COLUMNS = (
     *_VEHICLE,
     "query",
 )
+_TRACK_COLUMNS = ("query", "track_id", "x_m", "y_m")
 
 
 def write_crowd(folder: Path, problem: CrowdProblem) -> Path:
@@ -87,7 +88,9 @@ def read_tracks(path: Path, count: int) -> tuple[Positions, ...]:
     """
     found: list[dict[int, np.ndarray]] = [{} for _ in range(count)]
     with path.open(newline="", encoding="utf-8") as file:
-        for line, row in enumerate(csv.DictReader(file), start=2):
+        table = csv.DictReader(file)
+        require_columns(table, _TRACK_COLUMNS)
+        for line, row in enumerate(table, start=2):
             query, track_id = _whole(row, "query", line), _whole(row, "track_id", line)
             if not 0 <= query < count:
                 raise ValueError(

@@ -106,12 +106,21 @@ def read_states(path: Path, count: int) -> list[Answer | None]:
     number, and `KeyError` for a missing column.
     """
     with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        table = csv.DictReader(file)
+        require_columns(table, STATE)
+        rows = list(table)
     if len(rows) != count:
         raise ValueError(
             f"{count} rows are expected, one for each query, not {len(rows)}"
         )
     return [_answer(row, line) for line, row in enumerate(rows, start=2)]
+
+
+def require_columns(table: "csv.DictReader[str]", names: Iterable[str]) -> None:
+    """Raise `KeyError` with the first of the `names` that is missing in the header."""
+    for name in names:
+        if name not in (table.fieldnames or ()):
+            raise KeyError(name)
 
 
 def _answer(row: Mapping[str, str], line: int) -> Answer | None:

@@ -2,6 +2,8 @@
 
 import csv
 import math
+import os
+import signal
 import subprocess
 import tempfile
 import time
@@ -29,7 +31,10 @@ from fgtrack.ranking.problem import Answer, Problem, answer_of, cut_after
 
 WINDOW_S = 10.0
 """Window of the shipped estimators; it is longer than a scenario."""
-_TIMEOUT_S = 600.0
+TIME_LIMIT_S = 60.0
+"""Longest time of a run of a program."""
+NO_PART = 77
+"""Exit code of a program that is not made for a scenario, as of a skipped test of GNU Automake."""
 _SPARE_S = 1.5
 """Window of the shipped trackers beyond the longest delay; it reaches the oldest query."""
 _SAME = 1e-6
@@ -237,8 +242,9 @@ class Program(Method):
 
     is_traced = False
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, time_limit_s: float = TIME_LIMIT_S) -> None:
         self.name = path.name
+        self._time_limit_s = time_limit_s
         self._path = path.resolve()
 
     def answers(self, problem: Problem) -> Answers:
@@ -269,31 +275,64 @@ class Program(Method):
             measurements = write(Path(folder))
             states = Path(folder) / "states.csv"
             started_s = time.perf_counter()
-            try:
-                done = subprocess.run(
-                    [str(self._path), str(measurements), str(states)],
-                    capture_output=True,
-                    text=True,
-                    timeout=_TIMEOUT_S,
-                    check=False,
-                )
-            except FileNotFoundError as error:
-                raise MethodError(
-                    "the interpreter in its first line (#!) does not exist"
-                ) from error
-            except OSError as error:
-                raise MethodError(
-                    f"it cannot be started: {error.strerror}; the first line of a script begins with #!"
-                ) from error
-            except subprocess.TimeoutExpired as error:
-                raise MethodError(f"it takes more than {_TIMEOUT_S:g} s") from error
+            exit_code, errors = self._run([str(measurements), str(states)])
             seconds = time.perf_counter() - started_s
-            if done.returncode:
-                last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise MethodError(f"exit code {done.returncode}: {one_line(last)}")
+            last = one_line((errors.strip().splitlines() or ["no message"])[-1])
+            if exit_code == NO_PART:
+                raise NotImplementedError(f"exit code {exit_code}: {last}")
+            if exit_code:
+                raise MethodError(f"exit code {exit_code}: {last}")
+            if not states.exists():
+                raise MethodError(
+                    "the program ended with exit code 0 but wrote no states.csv: "
+                    "its second argument is the path of that file"
+                )
             try:
                 return read(states), seconds
             except KeyError as error:
-                raise MethodError(f"states.csv: column {error} is missing") from error
+                raise MethodError(
+                    f"states.csv: column {error} is missing; the first line must be the header"
+                ) from error
             except (OSError, ValueError, csv.Error) as error:
                 raise MethodError(f"states.csv: {one_line(str(error))}") from error
+
+    def _run(self, arguments: list[str]) -> tuple[int, str]:
+        """Return the exit code of the program, and its messages. Raises `MethodError` if it does not start or end."""
+        try:
+            process = subprocess.Popen(
+                [str(self._path), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                start_new_session=True,
+            )
+        except FileNotFoundError as error:
+            raise MethodError(
+                "the interpreter in its first line (#!) does not exist"
+            ) from error
+        except OSError as error:
+            raise MethodError(
+                f"it cannot be started: {error.strerror}; the first line of a script begins with #!"
+            ) from error
+        with process:
+            try:
+                _, errors = process.communicate(timeout=self._time_limit_s)
+            except subprocess.TimeoutExpired as error:
+                _end(process)
+                raise MethodError(
+                    f"a run takes more than {self._time_limit_s:g} s; --time-limit allows more"
+                ) from error
+            except BaseException:
+                _end(process)
+                raise
+        return process.returncode, errors
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a program and the programs that it has started."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()

@@ -8,7 +8,7 @@ from typing import Any
 from fgtrack.core.errors import CallError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.ranking.judge import judge
-from fgtrack.ranking.methods import Method, Program, Shipped
+from fgtrack.ranking.methods import TIME_LIMIT_S, Method, Program, Shipped
 from fgtrack.ranking.python_file import PythonMethod, python_file, python_module
 from fgtrack.ranking.result import Ranking
 from fgtrack.ranking.scenarios import SCENARIOS
@@ -25,19 +25,22 @@ def rank(
     *,
     num_runs: int = 10,
     seed: int = 1,
+    time_limit_s: float = TIME_LIMIT_S,
 ) -> Ranking:
     """Return the results of all `methods` in all `scenarios`, with the same measurements for all.
 
     A method is the name of an estimator, the path of a Python file or of a program, a
     class with `update` and `state_at`, or a function `fuse`. A method that fails in a
-    scenario has a result with the reason.
+    scenario has a result with the reason. A run of a program ends after `time_limit_s`.
 
     Raises `CallError` for an unknown method or scenario.
     """
-    return judge([method(each) for each in methods], scenarios, num_runs, seed)
+    return judge(
+        [method(each, time_limit_s) for each in methods], scenarios, num_runs, seed
+    )
 
 
-def method(like: MethodLike) -> Method:
+def method(like: MethodLike, time_limit_s: float = TIME_LIMIT_S) -> Method:
     """Return the method that `like` describes.
 
     `FILE.py:NAME` is a class or a function of a Python file, `MODULE:NAME` of an installed
@@ -53,7 +56,7 @@ def method(like: MethodLike) -> Method:
     if path.suffix == ".py" and path.is_file():
         return python_file(path)
     if path.is_file() and os.access(path, os.X_OK):
-        return Program(path)
+        return Program(path, time_limit_s)
     if path.is_file():
         raise CallError(
             f"{text}: is neither a Python file nor an executable program; "

@@ -421,7 +421,14 @@ def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
     ("text", "fault"),
     [
         ("#!/bin/sh\necho no model >&2\nexit 3\n", "exit code 3: no model"),
-        ("#!/bin/sh\n", "states.csv"),
+        (
+            "#!/bin/sh\n",
+            "the program ended with exit code 0 but wrote no states.csv: its second",
+        ),
+        (
+            "#!/bin/sh\nawk 'BEGIN { while (i++ < 15) print \"1,2,3,4\" }' > $2\n",
+            "states.csv: column 'x_m' is missing; the first line must be the header",
+        ),
         (
             "#!/bin/sh\nawk 'BEGIN { print \"x\"; while (i++ < 15) print 1 }' > $2\n",
             "states.csv: column 'x_m' is missing",
@@ -433,7 +440,7 @@ def test_a_shell_program_is_ranked(tmp_path: Path) -> None:
             "line 2: vx_mps is missing",
         ),
         (
-            "#!/bin/sh\necho x_m > $2\n",
+            "#!/bin/sh\necho x_m,y_m,vx_mps,vy_mps > $2\n",
             "15 rows are expected, one for each query, not 0",
         ),
     ],
@@ -445,6 +452,35 @@ def test_a_program_that_fails_has_one_clear_line(
     assert result.problem is not None
     assert fault in result.problem
     assert "\n" not in result.problem
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
+def test_a_program_that_is_not_made_for_a_scenario_takes_no_part(
+    tmp_path: Path,
+) -> None:
+    text = '#!/bin/sh\ngrep -q \'"cv"\' "${1%/*}/problem.json" && exec LAST "$@"\n'
+    text = text.replace("LAST", str(program(tmp_path / "last", SHELL)))
+    path = program(tmp_path / "cv", text + "echo constant velocity only >&2\nexit 77\n")
+    words = ["rank", str(path), "--scenario", "ctrv", "--scenario", "linear"]
+    done = CliRunner().invoke(app, [*words, "--runs", "2"])
+    assert done.exit_code == 0, done.output
+    assert "takes no part: exit code 77: constant velocity only" in done.output
+    assert "the present estimate departs" in done.output
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
+def test_a_program_that_never_ends_is_ended_with_its_children(tmp_path: Path) -> None:
+    text = f"#!/bin/sh\nsleep 1000 &\necho $! > {tmp_path}/child\nwait\n"
+    words = ["rank", str(program(tmp_path / "never", text)), "--scenario", "linear"]
+    done = CliRunner().invoke(app, [*words, "--time-limit", "2"])
+    assert done.exit_code != 0
+    assert "no result: a run takes more than 2 s" in done.output
+    child = int((tmp_path / "child").read_text())
+    try:
+        state = Path(f"/proc/{child}/stat").read_text().split()[2]
+    except OSError:
+        state = "gone"
+    assert state in ("gone", "Z")
 
 
 def test_a_method_may_be_in_an_installed_module(

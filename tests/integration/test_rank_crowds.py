@@ -183,6 +183,9 @@ def test_tracks_of_a_program_are_read_or_refused(tmp_path: Path) -> None:
         path.write_text("query,track_id,x_m,y_m\n" + rows, encoding="utf-8")
         with pytest.raises(ValueError, match=re.escape(fault)):
             read_tracks(path, 2)
+    path.write_text("0,7,1,2\n", encoding="utf-8")
+    with pytest.raises(KeyError, match="query"):
+        read_tracks(path, 2)
 
 
 def test_files_hold_all_scans_and_queries(
