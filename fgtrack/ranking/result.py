@@ -224,14 +224,14 @@ class Ranking:
         records: dict[str, dict[str, object]] = {}
         for each in one:
             record = records.setdefault(each.method, {"method": each.method})
-            record[each.scenario] = each.deviation
+            record[each.scenario] = each.deviation if each.is_complete else math.nan
         columns = [
             Column("method", left=True),
             *(Column(name, text=_scientific) for name in scenarios),
         ]
         note = (
             "largest deviation of the present x, y, vx, vy from the exact joint estimate, in its standard deviations; "
-            f"{self.num_runs} runs; a dash: no result"
+            f"{self.num_runs} runs; a dash: no result, or present answers are missing"
         )
         ordered = sorted(records.values(), key=lambda record: _farthest(record))
         return Table(

@@ -642,6 +642,7 @@ def test_a_single_missing_answer_is_named() -> None:
     )
     found = Ranking((result,), 1)
     assert "exact in 0 of 1" in found.summary("ekf-replay")
+    assert math.isnan(found.deviations().records[0]["linear"])
 
 
 def test_what_a_function_does_not_fuse_is_not_known(tmp_path: Path) -> None:
