@@ -421,8 +421,9 @@ class DecidedTracker(MultiObjectTracker):
         )
         again_read = []
         for public, places in self._read_newer(anew, lost, won).items():
-            if self._began_before_horizon(public):
-                again_read += list(filter(self._withdraw, reversed(places)))
+            taken = [place for place in reversed(places) if self._withdraw(place)]
+            if len(taken) == len(places) or self._began_before_horizon(public):
+                again_read += taken
             else:
                 anew.add(public)
         chosen = [
