@@ -87,7 +87,15 @@ def findings_in_messages(
             return  # it ends before its first case, and would do so again
 
 
-@pytest.mark.parametrize("name", live.ESTIMATORS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        if name in ("ekf-replay", "smoother-banded")
+        else pytest.param(name, marks=pytest.mark.slow)
+        for name in live.ESTIMATORS
+    ],
+)
 def test_a_few_wrong_values_in_live_messages(
     server: Server, name: str, tmp_path: Path
 ) -> None:

@@ -83,7 +83,7 @@ def test_a_restored_tracker_goes_on_with_the_same_bits_as_often_as_wanted(
         assert bits(run) == bits(expected)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_window_of_the_batch_smoother_goes_on_from_its_estimates() -> None:
     before, _ = random_split("smoother-batch")
     tracker = tracker_of("smoother-batch")

@@ -52,7 +52,10 @@ def _findings(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("estimator", SOME)
+@pytest.mark.parametrize(
+    "estimator",
+    [*SOME[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in SOME[2:])],
+)
 def test_a_call_that_raises_ends_its_own_update_alone(estimator: str) -> None:
     def chosen(names: list[str]) -> list[str]:
         rest = [name for name in names if ".update" not in name and "Bank" not in name]
