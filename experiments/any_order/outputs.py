@@ -93,7 +93,7 @@ def share(expected: Mapping[int, FloatArray], found: Mapping[int, FloatArray]) -
 
 
 def _lagged(run: Run, lagged: Columns, lag_s: float) -> Run:
-    """Return the run with the states of `lag_s` ago. Their status is that of the track at the same tick."""
+    """Return the run with the states of `lag_s` ago. A state has the status of its track at the same tick."""
     lag_ns = round(lag_s * NS_PER_S)
     tracks, timing = run.tables["tracks"], run.tables["timing"]
     status = dict(

@@ -113,7 +113,7 @@ def _pairs(
 ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
     """Return the pairs of tracks and candidates inside the gate, their log-densities, and the pairs with a jump.
 
-    The correlated error of a pair is that of the track's last detection, or with the probability of a jump new.
+    A pair keeps the correlated error of the track's last detection. With the probability of a jump the error is new.
     """
     m = len(entry.candidates)
     if not m or not len(nodes.roots):

@@ -115,7 +115,7 @@ def _least(gains: Sequence[float], most: int, lowest: float) -> float:
 
 
 class _Solution(NamedTuple):
-    """An assignment, which is the best one of all that have the same pairs for the first `decided` open tracks."""
+    """The best assignment among those with the same pairs for the first `decided` open tracks."""
 
     gain: float
     chosen: IntArray
