@@ -25,12 +25,21 @@ class Decision:
     """Reason in words, with the test and its number."""
     question: str | None = None
     """Question in one line with the key to set; given for an open question and for an unobservable assumption."""
+    is_provisional: bool = False
+    """True if the sensor is used as if an open question had the assumed answer; its settings are not written."""
 
     def __post_init__(self) -> None:
-        if self.certainty == "open" and (self.settings or self.question is None):
+        is_open = self.certainty == "open"
+        has_settings = bool(self.settings) and not self.is_provisional
+        if is_open and (has_settings or self.question is None):
             raise ValueError(
                 f"{self.about}, {self.what}: an open decision has a question and no settings"
             )
+
+    @property
+    def leaves_out(self) -> bool:
+        """True if the runs leave the sensor out until the question is answered."""
+        return self.certainty == "open" and not self.is_provisional
 
     @property
     def line(self) -> str:

@@ -56,8 +56,14 @@ class Draft:
         names = {
             item.about
             for item in self.decisions
-            if item.certainty == "open" and item.about not in ("ego", "the recording")
+            if item.leaves_out and item.about not in ("ego", "the recording")
         }
+        return tuple(sorted(names))
+
+    @property
+    def provisional_sensors(self) -> tuple[str, ...]:
+        """Sensors that the runs use with an assumed lever arm, although its question is open."""
+        names = {item.about for item in self.decisions if item.is_provisional}
         return tuple(sorted(names))
 
     @property
@@ -78,12 +84,14 @@ class Draft:
 
     @property
     def problem(self) -> str | None:
-        """Line on the questions that must be answered before all sensors are used; None without open questions."""
+        """Line on the open questions, and on the sensors that they concern; None without open questions."""
         asked = [item for item in self.decisions if item.certainty == "open"]
         if not asked:
             return None
         names = ", ".join(self.open_sensors)
         left_out = f"{names} left out of the runs; " if names else ""
+        if provisional := ", ".join(self.provisional_sensors):
+            left_out += f"{provisional} used with an assumed lever arm; "
         questions = "; ".join(f"{item.about}: {item.question}" for item in asked)
         return f"{left_out}open: {questions}"
 
@@ -121,8 +129,8 @@ class Draft:
     def to_yaml(self, head: Iterable[str] = ()) -> str:
         """Return YAML text of all settings that differ from the defaults; each decision has its reason as a comment.
 
-        Only the mapping of a sensor with an open question is written. The sensor is not
-        ignored, so the question is asked until it is answered.
+        Only the mapping of a sensor with an open question, or with an assumed lever arm,
+        is written. The sensor is not ignored, so the question is asked until it is answered.
         """
         comments = [item for part in self.parts for item in part.comments()]
         comments += [
@@ -134,7 +142,14 @@ class Draft:
         asked = [f"Open: {line}" for line in self.questions]
         unused = [f"Not used: {line}" for line in self.unused]
         notes = [f"{part.label}: {note}" for part in self.parts for note in part.notes]
-        return self.assumed.to_yaml([*head, *asked, *unused, *notes], comments)
+        config = self.assumed.config
+        sensors = {
+            name: item
+            for name, item in config.sensors.items()
+            if name not in self.provisional_sensors
+        }
+        written = replace(self.assumed, config=replace(config, sensors=sensors))
+        return written.to_yaml([*head, *asked, *unused, *notes], comments)
 
 
 def drafted(recording: Path | str, config: Config | None = None) -> Draft:

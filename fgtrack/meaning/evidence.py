@@ -38,7 +38,7 @@ def decided(
 
     Settings in `given`, the user's configuration, stay, and decisions about `settled`
     sensors are dropped. The recording is read again after a test has changed how it is
-    read. Later tests do not read a sensor with an open question.
+    read. Later tests do not read a sensor that a decision leaves out.
     """
     decisions: list[Decision] = []
     messages: Sequence[Message] | None = None
@@ -49,7 +49,7 @@ def decided(
         new = [each for each in test(sample) if each.about not in settled]
         before = config.input
         config = _with(config, new, sample)
-        asked = {each.about for each in new if each.certainty == "open"} - _NO_SENSORS
+        asked = {each.about for each in new if each.leaves_out} - _NO_SENSORS
         changes_times = any(
             path[-1] == "clock_offset_s" for each in new for path in each.settings
         )

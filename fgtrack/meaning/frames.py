@@ -22,6 +22,9 @@ _SURE_STDS = 4.0
 #: Ratio and difference of the distances from the ego and from the origin that decide.
 _NEARER = 0.5
 _FARTHER_M = 50.0
+#: Largest ratio of the deviations that counts less than distances with a smaller ratio than the second number.
+_WEAK_RATIO = 2.0
+_CLEARLY_NEARER = 0.25
 #: Fewest detections.
 _FEWEST = 30
 #: The vertical axis varies by less than this share of the horizontal axes.
@@ -45,27 +48,36 @@ def frame_of(points: Points, motion: EgoMotion) -> FrameTest:
     In the right frame objects keep their velocity for seconds. In the wrong frame they
     turn and accelerate with the ego. An ego on a straight road at constant speed
     decides nothing. Then the distances count: sensors detect objects near themselves.
+    Clear distances also count against a small difference of the motions.
     """
     if not motion or len(points.points_m) < _FEWEST:
         return FrameTest(None, False, "there is no ego, or there are few detections")
-    smooth, smooth_reason = _by_motion(points)
-    near, near_reason = _by_distance(points)
-    if smooth is None:
-        return FrameTest(
-            near,
-            False,
-            near_reason if near is not None else f"{smooth_reason}; {near_reason}",
-        )
-    contradictory = near is not None and near != smooth
-    reason = f"{smooth_reason}; {near_reason}" if contradictory else smooth_reason
-    return FrameTest(None if contradictory else smooth, contradictory, reason)
+    smooth = _by_motion(points)
+    near = _by_distance(points)
+    is_weak = smooth.ratio < _WEAK_RATIO and near.ratio > 1.0 / _CLEARLY_NEARER
+    if smooth.in_map is None or (near.in_map is not None and is_weak):
+        reason = near.reason
+        if near.in_map is None:
+            reason = f"{smooth.reason}; {near.reason}"
+        return FrameTest(near.in_map, False, reason)
+    if near.in_map in (None, smooth.in_map):
+        return FrameTest(smooth.in_map, False, smooth.reason)
+    return FrameTest(None, True, f"{smooth.reason}; {near.reason}")
 
 
-def _by_distance(points: Points) -> tuple[bool | None, str]:
-    """Return True if the detections are near the ego in the map, False in the ego's frame, None if undecided.
+class _Evidence(NamedTuple):
+    """Result of one test."""
 
-    The text contains the distances.
-    """
+    in_map: bool | None
+    """True for the map, False for the ego or the sensor; None if the test does not decide."""
+    reason: str
+    """The numbers in words."""
+    ratio: float = 1.0
+    """Ratio of the larger and the smaller number."""
+
+
+def _by_distance(points: Points) -> _Evidence:
+    """Test whether the detections are near the ego in the map, or in the ego's frame."""
     body_m = float(np.quantile(np.hypot(*points.points_m.T), 0.9))
     offsets_m = points.points_m - points.poses[:, :2]
     map_m = float(np.quantile(np.hypot(*offsets_m.T), 0.9))
@@ -73,18 +85,16 @@ def _by_distance(points: Points) -> tuple[bool | None, str]:
         f"90 % of the detections are within {body_m:.0f} m of the ego if they are in its frame, "
         f"{map_m:.0f} m if they are in the map"
     )
-    if abs(body_m - map_m) < _FARTHER_M or min(body_m, map_m) > _NEARER * max(
-        body_m, map_m
-    ):
-        return None, reason
-    return map_m < body_m, reason
+    ratio = max(body_m, map_m) / max(min(body_m, map_m), 1e-6)
+    if abs(body_m - map_m) < _FARTHER_M or ratio < 1.0 / _NEARER:
+        return _Evidence(None, reason, ratio)
+    return _Evidence(map_m < body_m, reason, ratio)
 
 
-def _by_motion(points: Points) -> tuple[bool | None, str]:
-    """Return True if objects keep their velocity in the map, False if they keep it in the ego's frame, None if
-    undecided.
+def _by_motion(points: Points) -> _Evidence:
+    """Test whether objects keep their velocity in the map, or in the ego's frame.
 
-    The text contains the deviations from constant velocity in both frames.
+    The numbers are the deviations from constant velocity in both frames.
     """
     gaps: list[FloatArray] = []
     for in_map in (False, True):
@@ -93,7 +103,7 @@ def _by_motion(points: Points) -> tuple[bool | None, str]:
         gaps += [_deviations_m(points, rows) for rows in _parts(chains)]
     table = np.concatenate(gaps) if gaps else np.empty((0, 6))
     if len(table) < _FEWEST_WINDOWS:
-        return None, "few objects are detected for seconds"
+        return _Evidence(None, "few objects are detected for seconds")
     in_map_m = np.hypot(*table[:, 0:2].T)
     in_body_m = np.hypot(*_least_turned(table).T)
     map_m, body_m = float(np.median(in_map_m)), float(np.median(in_body_m))
@@ -105,8 +115,8 @@ def _by_motion(points: Points) -> tuple[bool | None, str]:
     )
     ratio = max(map_m, body_m) / max(min(map_m, body_m), 1e-6)
     if abs(t) < _SURE_STDS or ratio < _RATIO:
-        return None, reason
-    return body_m > map_m, reason
+        return _Evidence(None, reason, ratio)
+    return _Evidence(body_m > map_m, reason, ratio)
 
 
 def _parts(chains: np.ndarray) -> list[np.ndarray]:

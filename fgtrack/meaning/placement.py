@@ -13,7 +13,7 @@ from fgtrack.inputs.geodetic import GEODETIC
 from fgtrack.inputs.settings import CsvTable, InputConfig, TopicInput
 from fgtrack.meaning.decision import Decision
 from fgtrack.meaning.frames import FrameTest, frame_of, is_optical
-from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
+from fgtrack.meaning.mounts import MountEstimate, Mounts, Pose2, estimated_mounts
 from fgtrack.meaning.sample import Sample
 from fgtrack.meaning.tracklets import Points, points_of
 
@@ -246,6 +246,9 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     - positions of sensors are in different frames, and nothing shows which frame is the ego's;
     - the traffic past the ego is more probable for another yaw than the assumed one.
 
+    A lever arm that all sensors share is an open question, too, if nothing shows it. The
+    sensors are used as if it were 0.
+
     Positions of a single sensor, or of sensors that agree, may be assumed in the ego's
     frame. A sensor that measures ranges and bearings may be assumed ahead if the ego
     does not move past objects.
@@ -269,7 +272,7 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
             question = _question(sample, name)
             yield Decision(name, "mount", {}, "open", doubts[name], question)
         elif name in mounts:
-            yield from _mount_decision(sample, mounts, name, path)
+            yield from _mount_decision(sample, mounts, name, path, shown)
         elif _has_unknown_header(sample, name):
             yield _unanswered(
                 sample, name, "it has no positions that the tests can use"
@@ -358,7 +361,8 @@ def mounts_of(
 
     References are sensors in the map, then sensors with a configured mount, then
     sensors with positions in the ego frame, first those that a header or the user
-    has put there (`shown`).
+    has put there (`shown`). If the axes of a reference are turned, the next reference is
+    a sensor whose axes are not.
     """
     used = [
         item
@@ -380,8 +384,33 @@ def mounts_of(
         name for name in points if frames[name] == "ego" and not points[name].is_polar
     ]
     known = [name for name in points if frames[name] == "map" or name in assumed]
-    known += sorted(in_ego, key=lambda name: (name not in shown, -size[name], name))
-    return estimated_mounts(points, motion, assumed, known)
+    in_ego.sort(key=lambda name: (name not in shown, -size[name], name))
+    found = estimated_mounts(points, motion, assumed, [*known, *in_ego])
+    straight = _straight_instead(found, in_ego, shown)
+    if not straight:
+        return found
+    in_ego.sort(key=lambda name: name not in straight)
+    return estimated_mounts(points, motion, assumed, [*known, *in_ego])
+
+
+def _straight_instead(
+    found: Mounts, in_ego: Sequence[str], shown: Set[str]
+) -> list[str]:
+    """Return a sensor with the axes of the ego for each group whose reference in the ego's frame has other axes."""
+    result = []
+    for reference in in_ego:
+        is_reference = found.references.get(reference) == reference
+        if reference in shown or not is_reference or found[reference].is_straight:
+            continue
+        straight = (
+            name
+            for name in in_ego
+            if found.references.get(name) == reference
+            and found[name].is_straight
+            and found[name].is_sure_of_yaw
+        )
+        result += list(straight)[:1]
+    return result
 
 
 def _unanswered(sample: Sample, name: str, why: str) -> Decision:
@@ -404,13 +433,15 @@ def _mount_decision(
     mounts: Mounts,
     name: str,
     path: tuple[str, ...],
+    shown: Set[str],
 ) -> Iterator[Decision]:
     """Yield the decision on the mount of one sensor."""
     item = mounts[name]
     reference = mounts.references.get(name, name)
     is_placed = mounts.is_placed(name)
     against = "" if reference == name else f"against {reference}: "
-    if against and reference not in mounts.known and not mounts[reference].is_known:
+    is_provisional = reference not in shown and _is_arm_open(sample, mounts, reference)
+    if against and is_provisional:
         against = f"against {reference}, whose lever arm is assumed: "
     if _is_read_in_ego(sample, name):
         # The recording itself puts the sensor into the ego, so nothing is changed.
@@ -422,12 +453,10 @@ def _mount_decision(
                 name, "mount", {}, "assumed", reason, _question(sample, name)
             )
         return
-    if item.is_off and is_placed:
-        frame = "optical" if _mapping_frame(sample, name) == "optical" else "sensor"
-        settings = {
-            ("sensors", name, "mount"): plain_mount(item.pose),
-            (*path, "frame"): frame,
-        }
+    if is_provisional and reference == name:
+        yield _assumed_arm(sample, item, path)
+    elif item.is_off and is_placed:
+        settings = _mounted_settings(sample, item, path)
         question = None
         if not item.is_known:
             question = (
@@ -436,8 +465,9 @@ def _mount_decision(
         elif item.rough_components:
             rough = " and ".join(item.rough_components)
             question = f"{rough} known roughly; {_question(sample, name)}"
+        reason = f"{against}{item.words}"
         yield Decision(
-            name, "mount", settings, "tested", f"{against}{item.words}", question
+            name, "mount", settings, "tested", reason, question, is_provisional
         )
     elif item.is_sure_of_yaw and is_placed:
         reason = f"no mount is significant, {against}{item.words}"
@@ -446,12 +476,52 @@ def _mount_decision(
             if item.is_known
             else f"its lever arm is assumed to be 0; {_question(sample, name)}"
         )
-        yield Decision(name, "mount", {}, "tested", reason, question)
+        yield Decision(name, "mount", {}, "tested", reason, question, is_provisional)
     elif _has_unknown_header(sample, name):
         yield _unanswered(sample, name, f"its frame is unknown: {item.why}")
     else:
         reason = f"at the origin of the ego, its axis ahead: {item.why}"
         yield Decision(name, "mount", {}, "assumed", reason, _question(sample, name))
+
+
+def _is_arm_open(sample: Sample, mounts: Mounts, reference: str) -> bool:
+    """True if the lever arm of a reference, which all its sensors share, is neither given nor estimated exactly.
+
+    Positions x, y count as positions in the ego's frame, unless their axes are turned. A
+    sensor on an ego that hardly moves has its own frame.
+    """
+    if reference in mounts.in_map or _is_mounted(sample, reference):
+        return False
+    if _is_read_in_ego(sample, reference):
+        return False
+    item = mounts[reference]
+    is_in_ego = _mapping_frame(sample, reference) in (None, "ego")
+    if item.traffic == "none" or (is_in_ego and not item.is_off):
+        return False
+    return not item.has_exact_arm
+
+
+def _assumed_arm(
+    sample: Sample, item: MountEstimate, path: tuple[str, ...]
+) -> Decision:
+    """Return the open decision on the lever arm of a reference, which is used as if the lever arm were assumed."""
+    question = (
+        "all objects are displaced by the error of its assumed lever arm; "
+        f"{_question(sample, item.sensor)}"
+    )
+    settings = _mounted_settings(sample, item, path) if item.is_off else {}
+    return Decision(item.sensor, "mount", settings, "open", item.words, question, True)
+
+
+def _mounted_settings(
+    sample: Sample, item: MountEstimate, path: tuple[str, ...]
+) -> dict[tuple[str, ...], object]:
+    """Return the settings with an estimated mount."""
+    is_optical = _mapping_frame(sample, item.sensor) == "optical"
+    return {
+        ("sensors", item.sensor, "mount"): plain_mount(item.pose),
+        (*path, "frame"): "optical" if is_optical else "sensor",
+    }
 
 
 def _is_read_in_ego(sample: Sample, name: str) -> bool:

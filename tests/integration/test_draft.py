@@ -292,6 +292,33 @@ def test_a_sensor_with_an_open_question_is_left_out_and_asked_again(
     assert final.config.sensors["lidar_rear"].std
 
 
+def test_a_sensor_with_an_assumed_lever_arm_is_used_and_asked_again(
+    tables, tests, tmp_path, capsys
+):
+    def assumes_the_arm(sample):
+        mount = {("sensors", "lidar_rear", "mount"): {"yaw_rad": 0.0, "x_m": 0.0}}
+        question = "where is it mounted? Set sensors.lidar_rear.mount"
+        if sample.is_open(("sensors", "lidar_rear", "mount")):
+            yield Decision(
+                "lidar_rear", "mount", mount, "open", "yaw 0", question, True
+            )
+
+    tests(assumes_the_arm)
+    draft = drafted(tables)
+    assert draft.open_sensors == ()
+    assert draft.config.sensors["lidar_rear"].mount == Mount()
+    assert "lidar_rear used with an assumed lever arm" in draft.problem
+    (tmp_path / "s.yaml").write_text(draft.to_yaml())
+    again = Config.from_yaml(tmp_path / "s.yaml")
+    assert list(again.sensors) == ["radar_front"]
+    assert drafted(tables, again).problem == draft.problem
+    words = ["replay", str(tables), "-o", str(tmp_path / "run"), "-e", "ekf-replay"]
+    assert command(words) == 1
+    assert "lidar_rear used with an assumed lever arm" in capsys.readouterr().err
+    mount = {"sensors.lidar_rear.mount": {"x_m": -1.0, "y_m": 0.5}}
+    assert drafted(tables, again.replace(mount)).problem is None
+
+
 @pytest.mark.parametrize("test", [reads_the_map, finds_the_mount])
 def test_what_the_user_sets_stays_and_everything_else_is_computed(tables, tests, test):
     tests(test)

@@ -8,6 +8,7 @@ import pytest
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.meaning import frames
 from fgtrack.meaning.frames import frame_of, is_optical
 from fgtrack.meaning.mounts import Mounts, Pose2, estimated_mounts
 from fgtrack.meaning.mounts.table import Table
@@ -183,6 +184,19 @@ def test_the_frame_of_positions_is_tested(form: str, turning: float) -> None:
     result = frame_of(unknown, motion)
     assert result.in_map == (form == "map")
     assert "m" in result.reason
+
+
+@pytest.mark.parametrize(("ratio", "in_map"), [(5.0, None), (1.4, False)])
+def test_clear_distances_count_more_than_a_small_difference_of_the_motions(
+    monkeypatch: pytest.MonkeyPatch, ratio: float, in_map: bool | None
+) -> None:
+    lone = (Sensor("radar", form="ego"),)
+    points, motion = points_of(DRIVES.drive(1, lone, turning=0.0).messages)
+    for_the_map = frames._Evidence(True, "the motions prefer the map", ratio)
+    monkeypatch.setattr(frames, "_by_motion", lambda _: for_the_map)
+    result = frame_of(points["radar"], motion)
+    assert result.is_contradictory == (in_map is None)
+    assert result.in_map == in_map
 
 
 def test_the_frame_is_undecided_while_the_ego_stands_at_the_origin() -> None:

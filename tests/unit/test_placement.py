@@ -63,9 +63,14 @@ def test_a_lone_radar_in_a_convoy_is_asked_for() -> None:
     assert "sensors.radar.mount" in str(found["radar"].question)
 
 
-def test_traffic_confirms_that_a_lone_radar_looks_ahead() -> None:
+def test_traffic_confirms_that_a_lone_radar_looks_ahead_but_asks_for_its_lever_arm() -> (
+    None
+):
     found = decisions(1, Sensor("radar", half_view_rad=0.9), parked=0)
-    assert found["radar"].certainty == "tested"
+    assert found["radar"].certainty == "open"
+    assert found["radar"].is_provisional
+    assert not found["radar"].leaves_out
+    assert not found["radar"].settings
     assert "objects stand still or move along" in found["radar"].reason
     assert "sensors.radar.mount" in str(found["radar"].question)
 
@@ -115,9 +120,12 @@ def test_radars_in_different_axes_are_asked_for_together() -> None:
 @pytest.mark.parametrize("parked", [0, 1])
 def test_traffic_shows_the_yaw_of_a_lone_radar(seed: int, parked: int) -> None:
     found = decisions(seed, Sensor("radar", 0.8, half_view_rad=1.3), parked=parked)
-    assert found["radar"].certainty == "tested"
+    assert found["radar"].certainty == "open"
+    assert not found["radar"].leaves_out
     assert yaw_rad(found["radar"]) == pytest.approx(0.8, abs=0.03)
-    assert "components without an interval" in str(found["radar"].question)
+    assert "displaced by the error of its assumed lever arm" in str(
+        found["radar"].question
+    )
 
 
 def yaw_rad(decision: Decision) -> float:
@@ -141,3 +149,20 @@ def test_a_mount_against_an_assumed_lever_arm_names_the_assumption() -> None:
     reasons = sorted(item.reason for item in found.values())
     assert "whose lever arm is assumed" in reasons[0]
     assert "objects stand still or move along" in reasons[1]
+    assert all(item.is_provisional for item in found.values())
+    assert sorted(item.certainty for item in found.values()) == ["open", "tested"]
+
+
+def test_positions_with_the_axes_of_the_ego_are_the_reference_of_turned_positions() -> (
+    None
+):
+    roof = Sensor("roof", 0.1, 1.2, form="sensor", half_view_rad=math.pi, clutter=0.2)
+    camera = Sensor("camera", form="ego", half_view_rad=0.9, clutter=0.2)
+    found = decisions(1, roof, camera, parked=1)
+    assert yaw_rad(found["roof"]) == pytest.approx(0.1, abs=0.02)
+    assert found["roof"].settings["sensors", "roof", "mount"] == {
+        "x_m": pytest.approx(1.2, abs=0.5),
+        "y_m": pytest.approx(0.0, abs=0.2),
+        "yaw_rad": pytest.approx(0.1, abs=0.02),
+    }
+    assert not any(item.is_provisional for item in found.values())

@@ -111,6 +111,15 @@ def _group_estimates(
         stds = tuple(best.stds[3 * k : 3 * k + 3].tolist())
         dof = tuple(best.dof[3 * k : 3 * k + 3].tolist())
         traffic: Traffic = "none" if k else reference.traffic
-        item = MountEstimate(name, *pose, stds, dof, count, why, traffic=traffic)
+        item = MountEstimate(
+            name,
+            *pose,
+            stds,
+            dof,
+            count,
+            why,
+            traffic=traffic,
+            detection_std_m=sensors[name].std_m,
+        )
         result.append(item.judged(assumed.get(name, Pose2())))
     return result

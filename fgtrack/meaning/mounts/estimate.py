@@ -33,6 +33,8 @@ SMALLEST_M = 0.1
 _KNOWN_YAW_RAD = 0.05
 #: Half width from which a lever arm is known roughly; the unknown hulls of a few objects cause less.
 _ROUGH_M = 2.0
+#: Half width up to which the lever arm of a reference is exact, if its detections are more exact.
+_EXACT_M = 0.5
 
 
 IN_MAP = "its detections are in the map"
@@ -68,6 +70,8 @@ class MountEstimate:
     """True if the mount differs from the assumed one significantly (99.9 %), and enough to matter."""
     traffic: Traffic = "none"
     """What the motion of the objects past the ego shows about the yaw of a reference."""
+    detection_std_m: float = 0.0
+    """Standard deviation of a detection on each axis, at the median range."""
 
     @property
     def pose(self) -> Pose2:
@@ -92,6 +96,17 @@ class MountEstimate:
         """Components of the lever arm that are estimated, but within more than 2 m (95 %)."""
         widths = zip(("x_m", "y_m"), self.half_widths[1:], strict=True)
         return tuple(name for name, half in widths if _ROUGH_M < half < math.inf)
+
+    @property
+    def has_exact_arm(self) -> bool:
+        """True if the 95 % interval of the lever arm is at most as wide as the interval of a detection, or 0.5 m."""
+        limit_m = max(_EXACT_M, 2.0 * self.detection_std_m)
+        return max(self.half_widths[1:]) <= limit_m
+
+    @property
+    def is_straight(self) -> bool:
+        """True if the axes of the ego are within the 95 % interval of the yaw."""
+        return abs(wrap_angle(self.yaw_rad)) <= self.half_widths[0]
 
     @property
     def is_sure_of_yaw(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 
 from fgtrack.core.geometry import rotations
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.meaning.tracklets import Noise, Points, tracklets
+from fgtrack.meaning.tracklets import Noise, Points, sights_m, tracklets
 
 __all__ = ["Common", "SensorTracks", "Track", "common_positions", "sensor_tracks"]
 
@@ -41,6 +41,12 @@ class SensorTracks(NamedTuple):
     points: Points
     noise: Noise
     tracks: list[Track]
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation of a detection on each axis, at the median range."""
+        ranges_m = np.hypot(*sights_m(self.points).T)
+        return float(np.sqrt(self.noise.variances(np.median(ranges_m)).mean()))
 
 
 def sensor_tracks(points: Points) -> SensorTracks:
