@@ -693,14 +693,15 @@ class DecidedTracker(MultiObjectTracker):
         if step is None:
             return
         best, nodes = step.hypotheses[0], step.nodes
-        matched = set(best.taken)
         exists = nodes.present
         living = set[int]()
-        for root, probability, hazard_hz, is_confirmed in zip(
+        for row, root, probability, hazard_hz, is_confirmed, is_coasting in zip(
+            best.rows.tolist(),
             nodes.roots[best.rows].tolist(),
             exists[best.rows].tolist(),
             nodes.hazards_hz[best.rows].tolist(),
             nodes.is_confirmed[best.rows].tolist(),
+            nodes.coasts[best.rows].tolist(),
             strict=True,
         ):
             public = self._public.get(root)
@@ -712,9 +713,17 @@ class DecidedTracker(MultiObjectTracker):
             if held is None:
                 continue
             living.add(held)
-            is_coasting = root not in matched
+            doubt = None
+            least = self._lives.doubt_probability
+            if is_confirmed and probability < least:
+                doubt = self.decisions.doubt(row, least)
             life = Life(
-                probability, step.stamp_ns, hazard_hz, is_confirmed, is_coasting
+                probability,
+                step.stamp_ns,
+                hazard_hz,
+                is_confirmed,
+                is_coasting,
+                doubt,
             )
             self._lives.live(held, life)
         for bank_id in self._parts.bank.track_ids:

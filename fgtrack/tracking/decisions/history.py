@@ -3,9 +3,10 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from fgtrack.core.state import Stateful
+from fgtrack.core.types import BoolArray
 from fgtrack.models.motion import MotionModel
 from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.nodes import (
@@ -38,6 +39,15 @@ class Settled:
     """Track of each candidate, by root; `NONE` for clutter."""
     ended: tuple[Ended, ...]
     """Tracks that end with the list."""
+
+
+class Doubt(NamedTuple):
+    """The newest lists make a track improbable."""
+
+    since_ns: int
+    """Stamp of the first of these lists."""
+    awaited: BoolArray
+    """True for each sensor that could show the object, shape (sensors,)."""
 
 
 class Decisions(Stateful):
@@ -137,6 +147,23 @@ class Decisions(Stateful):
         self._steps[at:] = steps
         self._published[at:] = [NONE] * len(steps)
         return list(self._changes(at))[::-1]
+
+    def doubt(self, row: int, least: float) -> Doubt:
+        """Return since when the track in a `row` of the newest step exists with a probability below `least`."""
+        newest = self._steps[-1]
+        root = newest.nodes.roots[row]
+        since_ns = newest.stamp_ns
+        for step, number in zip(
+            reversed(self._steps), reversed(self._published), strict=True
+        ):
+            rows = step.hypotheses[number].rows
+            own = rows[step.nodes.roots[rows] == root]
+            if not len(own) or step.nodes.present[own[0]] >= least:
+                break
+            since_ns = step.stamp_ns
+        ego = None if newest.entry is None else newest.entry.scan.ego
+        views = self._rules.views.of(newest.nodes.means[row : row + 1, :2], ego)
+        return Doubt(since_ns, views[0])
 
     def next_root(self) -> int:
         """Return the next number of a track, which is not given again."""

@@ -10,6 +10,7 @@ from fgtrack.core.state import Stateful
 from fgtrack.core.time import seconds
 from fgtrack.core.types import IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
+from fgtrack.tracking.decisions.history import Doubt
 from fgtrack.tracking.lives.counters import Scan
 from fgtrack.tracking.lives.existence import ExistenceRules
 from fgtrack.tracking.lives.latency import FOREVER
@@ -19,7 +20,14 @@ from fgtrack.tracking.preprocess import Candidate, Candidates
 class Life:
     """Existence of one track after the newest list."""
 
-    __slots__ = ("exists", "hazard_hz", "is_coasting", "is_confirmed", "stamp_ns")
+    __slots__ = (
+        "doubt",
+        "exists",
+        "hazard_hz",
+        "is_coasting",
+        "is_confirmed",
+        "stamp_ns",
+    )
 
     def __init__(
         self,
@@ -28,9 +36,11 @@ class Life:
         hazard_hz: float,
         is_confirmed: bool,
         is_coasting: bool,
+        doubt: Doubt | None = None,
     ) -> None:
         self.exists, self.stamp_ns, self.hazard_hz = exists, stamp_ns, hazard_hz
         self.is_confirmed, self.is_coasting = is_confirmed, is_coasting
+        self.doubt = doubt
 
     def at(self, stamp_ns: int) -> float:
         """Return the probability that the object exists at a stamp."""
@@ -45,6 +55,8 @@ class DecidedLives(Stateful):
         "lives",
         "_present_ns",
         "_known_ns",
+        "_processed_ns",
+        "_watermarks_ns",
         "_ended",
         "_confirmed",
     )
@@ -60,6 +72,13 @@ class DecidedLives(Stateful):
         self._ended: dict[int, int] = {}
         """Tracks that have ended, and may come back by a late list."""
         self._present_ns = self._known_ns = 0
+        self._processed_ns = FOREVER
+        self._watermarks_ns: IntArray | None = None
+
+    @property
+    def doubt_probability(self) -> float:
+        """Probability below which a confirmed track is doubted."""
+        return self._rules.doubt_probability
 
     def suspend(self, track_id: int, stamp_ns: int) -> None:
         """Note that a track has ended with the list at `stamp_ns`, and may come back."""
@@ -118,6 +137,7 @@ class DecidedLives(Stateful):
         if watermarks_ns is not None and len(watermarks_ns):
             known_ns = min(known_ns, int(watermarks_ns.min()))
         self._known_ns = min(known_ns, processed_ns)
+        self._processed_ns, self._watermarks_ns = processed_ns, watermarks_ns
         least = self._rules.delete_probability
         for each in [
             i for i, life in self.lives.items() if life.at(self._known_ns) < least
@@ -147,19 +167,27 @@ class DecidedLives(Stateful):
         for each in track_ids:
             life = self.lives.get(each)
             exists = 0.0 if life is None else life.at(self._present_ns)
-            known = 0.0 if life is None else life.at(self._known_ns)
             probabilities.append(exists)
-            if (
-                life is None
-                or not life.is_confirmed
-                or known < self._rules.doubt_probability
-            ):
+            if life is None or not life.is_confirmed or self._is_doubted(life):
                 statuses.append(TrackStatus.TENTATIVE)
             elif life.is_coasting:
                 statuses.append(TrackStatus.COASTING)
             else:
                 statuses.append(TrackStatus.CONFIRMED)
         return statuses, probabilities
+
+    def _is_doubted(self, life: Life) -> bool:
+        """True for a track that is improbable, whatever the lists that are still due show.
+
+        So a late sensor does not make its tracks tentative.
+        """
+        if life.doubt is None:
+            return life.at(self._known_ns) < self._rules.doubt_probability
+        known_ns = min(self._present_ns, self._processed_ns)
+        if self._watermarks_ns is not None and life.doubt.awaited.any():
+            due_ns = self._watermarks_ns[life.doubt.awaited].min()
+            known_ns = min(known_ns, int(due_ns))
+        return known_ns >= life.doubt.since_ns
 
 
 Lives = Mapping[int, Life]

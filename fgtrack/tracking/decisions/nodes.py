@@ -46,6 +46,8 @@ class Nodes:
     """Numbers of the sensors that started the tracks."""
     own: FloatArray
     """Probability that the track is no second return of another track."""
+    coasts: BoolArray
+    """True for each track that was missed by the last list that could show it."""
     descriptions: tuple[Description, ...]
 
     @property
@@ -72,6 +74,7 @@ class Nodes:
             self.misses.take(rows),
             self.sensors.take(rows),
             self.own.take(rows),
+            self.coasts.take(rows),
             tuple([self.descriptions[row] for row in rows.tolist()]),
         )
 
@@ -132,6 +135,7 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
         np.zeros(0),
+        np.zeros(0, dtype=bool),
         (),
     )
     return Step(

@@ -66,6 +66,7 @@ def started(
         np.zeros(n, dtype=np.int64),
         np.full(n, entry.index),
         np.ones(n),
+        np.zeros(n, dtype=bool),
         tuple([entry.descriptions[column] for column in columns]),
     )
 
@@ -140,6 +141,7 @@ def updated(
         hits=nodes.hits + hit,
         counts=nodes.counts + (hit & of_sensor),
         misses=nodes.misses + (~hit & of_sensor & table.in_view[rows]),
+        coasts=~hit & (nodes.coasts | table.in_view[rows]),
         descriptions=tuple(descriptions),
     )
 

@@ -1,0 +1,77 @@
+"""Status of tracks whose decisions late data may change."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fgtrack import Config, Detection, DetectionList, TrackReport
+from fgtrack.pipeline.build import build_tracker
+
+MS = 1_000_000
+PERIOD_NS = 50 * MS
+LATE_NS = 150 * MS
+
+
+def published(
+    sensors: Mapping[str, Mapping[str, object]], lists: Sequence[DetectionList]
+) -> list[tuple[TrackReport, ...]]:
+    """Return the tracks at the receipt of each list."""
+    config = Config.from_dict(
+        {
+            "estimator": "ekf-replay",
+            "association": {"kind": "hypotheses"},
+            "sensors": sensors,
+            "motion": {"kind": "cv", "std_per_s": {"velocity": 5.0}},
+            "clock": {"node_hz": None},
+        }
+    )
+    tracker, found = build_tracker(config), []
+    for each in sorted(lists, key=lambda one: one.receipt_ns):
+        tracker.receive(each)
+        found.append(tracker.tick(each.receipt_ns).tracks)
+    return found
+
+
+def seen(sensor: str, stamp_ns: int, delay_ns: int, x_m: float | None) -> DetectionList:
+    objects = [] if x_m is None else [Detection(x_m=x_m, y_m=0.0)]
+    return DetectionList(sensor, stamp_ns, stamp_ns + delay_ns, objects, frame="map")
+
+
+def test_a_car_that_the_late_sensor_always_shows_stays_confirmed_while_the_other_one_misses_it() -> (
+    None
+):
+    rng = np.random.default_rng(2)
+    lists = [seen("lidar", k * PERIOD_NS, LATE_NS, 0.5 * k) for k in range(80)]
+    lists += [
+        seen(
+            "radar",
+            k * PERIOD_NS + 20 * MS,
+            0,
+            0.5 * k + 0.2 if rng.random() < 0.5 else None,
+        )
+        for k in range(80)
+    ]
+    sensor = {"std": {"x_m": 0.3, "y_m": 0.3}, "detection_probability": 0.95}
+    found = published({"lidar": sensor, "radar": sensor}, lists)
+    statuses = [[track.status for track in tracks] for tracks in found[40:]]
+    assert min(each.score or 0.0 for tracks in found[40:] for each in tracks) < 0.5, (
+        "the RADAR's misses never make the car improbable, so this test shows nothing"
+    )
+    assert all(len(own) == 1 and own[0] != "tentative" for own in statuses)
+
+
+def test_a_list_that_cannot_show_a_car_does_not_make_the_car_coast() -> None:
+    lists = [seen("lidar", k * PERIOD_NS, 0, 0.5 * k) for k in range(40)]
+    lists += [seen("radar", k * PERIOD_NS + 20 * MS, 0, None) for k in range(40)]
+    lidar = {"std": {"x_m": 0.3, "y_m": 0.3}}
+    found = published({"lidar": lidar, "radar": {**lidar, "scan": False}}, lists)
+    assert {each.status for tracks in found[20:] for each in tracks} == {"confirmed"}
+
+
+def test_a_car_that_the_last_list_misses_coasts() -> None:
+    lists = [
+        seen("lidar", k * PERIOD_NS, 0, 0.5 * k if k < 39 else None) for k in range(40)
+    ]
+    found = published({"lidar": {"std": {"x_m": 0.3, "y_m": 0.3}}}, lists)
+    assert [each.status for each in found[-1]] == ["coasting"]
+    assert [each.status for each in found[-2]] == ["confirmed"]
