@@ -314,7 +314,7 @@ def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
 def _squares(matching: Matching) -> dict[tuple[int, int], float]:
     tracks, truth = (
         matching.tracks.where(matching.paired),
-        matching.true_states[matching.paired],
+        matching.truth_of(matching.paired),
     )
     errors = (tracks["x_m"] - truth[:, 0]) ** 2 + (tracks["y_m"] - truth[:, 1]) ** 2
     keys = zip(

@@ -141,7 +141,7 @@ def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
     matching = match(replay(iter(messages), config))
     tracks, truth = (
         matching.tracks.where(matching.paired),
-        matching.true_states[matching.paired],
+        matching.truth_of(matching.paired),
     )
     settled = tracks["stamp_ns"] >= matching.tracks["stamp_ns"].min() + nanoseconds(
         SETTLED_S

@@ -58,24 +58,16 @@ def sums(
 
 def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
     """Squared errors of what the states predict, where all runs predict the same object from the same stamp."""
-    found = [
-        displacements(one.run, one.matching) for one in runs if one.matching is not None
-    ]
-    squares = [
-        dict(
-            zip(
-                zip(one.stamps_ns.tolist(), one.object_index.tolist(), strict=True),
-                column,
-                strict=True,
+    column = round(horizon_s / PREDICTION_STEP_S) - 1
+    squares: list[dict[tuple[int, int], float]] = [{} for _ in runs]
+    for one, mine in zip(runs, squares, strict=True):
+        for block in displacements(one.run, one.matching) if one.matching else ():
+            places_of = zip(
+                block.stamps_ns.tolist(), block.object_index.tolist(), strict=True
             )
-        )
-        for one in found
-        for column in [
-            np.square(
-                one.values["arc"][:, round(horizon_s / PREDICTION_STEP_S) - 1]
-            ).tolist()
-        ]
-    ]
+            values_m2 = np.square(block.values["arc"][:, column]).tolist()
+            mine.update(zip(places_of, values_m2, strict=True))
+    squares = [mine for mine, one in zip(squares, runs, strict=True) if one.matching]
     places = sorted(functools.reduce(set.intersection, (set(each) for each in squares)))
     values = np.array([[each[place] for each in squares] for place in places]).reshape(
         -1, len(runs)

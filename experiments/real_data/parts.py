@@ -78,7 +78,7 @@ def counted(matching: Matching) -> FloatArray:
         np.bincount(matching.tick_index[rows], minlength=n)
         for rows in (~paired, paired)
     )
-    x_m, y_m = matching.true_states[paired, :2].T
+    x_m, y_m = matching.truth_of(paired)[:, :2].T
     tracks = matching.tracks.where(paired)
     distances_m = np.hypot(tracks["x_m"] - x_m, tracks["y_m"] - y_m)
     squared_m2 = np.bincount(matching.tick_index[paired], distances_m**2, minlength=n)

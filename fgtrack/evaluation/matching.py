@@ -12,6 +12,7 @@ from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import (
     TruePath,
     in_ignored_regions,
+    present_objects,
     states_of,
     true_paths,
     visible,
@@ -34,11 +35,6 @@ class Matching:
     """The r evaluated rows of tracks.csv, during the time with truth."""
     object_index: IntArray
     """Index of the paired object of each row, shape (r,); `NO_OBJECT` if no object is paired."""
-    true_states: FloatArray
-    """x, y, yaw, speed and yaw rate of the row's object at the row's stamp, shape (r, 5).
-
-    NaN for a row without an object.
-    """
     near: NearPairs
     """Pairs of a row and an object at the row's stamp, nearer than twice the gate."""
     now_ns: IntArray
@@ -61,6 +57,20 @@ class Matching:
     def paired(self) -> BoolArray:
         """Mask of the rows with an object, shape (r,)."""
         return np.asarray(self.object_index != NO_OBJECT)
+
+    @property
+    def true_states(self) -> FloatArray:
+        """x, y, yaw, speed and yaw rate of the row's object at the row's stamp, shape (r, 5).
+
+        NaN for a row without an object. The array is made at each use.
+        """
+        return states_of(self.paths, self.object_index, self.tracks["stamp_ns"])
+
+    def truth_of(self, rows: BoolArray | IntArray) -> FloatArray:
+        """Return `true_states` of the rows selected by a mask, shape (r,), or by indices."""
+        return states_of(
+            self.paths, self.object_index[rows], self.tracks["stamp_ns"][rows]
+        )
 
 
 @dataclass(frozen=True)
@@ -115,18 +125,14 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     paired = np.flatnonzero(object_index != NO_OBJECT)
     track_ids = np.full((timing.num_rows, len(paths)), NO_TRACK)
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
-    states = states_of(paths, object_index, tracks["stamp_ns"])
     return Matching(
         paths=tuple(paths),
         tracks=tracks,
         object_index=object_index,
-        true_states=states,
         near=near,
         now_ns=timing["now_ns"],
         tick_index=tick_index,
-        present=np.stack(
-            [np.isfinite(path.at(timing["now_ns"])[:, 0]) for path in paths], axis=-1
-        ),
+        present=present_objects(paths, timing["now_ns"]),
         track_ids=track_ids,
         in_view=visible(run, paths, timing["now_ns"]),
     )
@@ -135,7 +141,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
 def track_errors(matching: Matching) -> TrackErrors:
     """Return the errors of the paired rows against the truth at their stamps."""
     tracks = matching.tracks.where(matching.paired)
-    values = state_errors(tracks, matching.true_states[matching.paired])
+    values = state_errors(tracks, matching.truth_of(matching.paired))
     return TrackErrors(
         tracks["stamp_ns"],
         matching.object_index[matching.paired],
@@ -171,7 +177,7 @@ def position_nees(matching: Matching) -> FloatArray:
     NaN where the covariance is not positive definite.
     """
     return position_squares(
-        matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+        matching.tracks.where(matching.paired), matching.truth_of(matching.paired)
     )
 
 
@@ -203,13 +209,15 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     row_of = np.full(matching.tracks.num_rows, -1)
     row_of[rows] = np.arange(len(rows))
     near = matching.near
-    near = replace(near, rows=row_of[near.rows])
-    near = near.where(near.rows >= 0)
-    near = near.where(present[tick_index[near.rows], near.objects])
+    own = row_of[near.rows]
+    kept = np.flatnonzero(own >= 0)
+    kept = kept[present[tick_index[own[kept]], near.objects[kept]]]
+    if (np.diff(own[kept]) < 0).any():
+        kept = kept[np.lexsort((near.objects[kept], own[kept]))]
     return Scenes(
         tick_index,
         matching.tracks["track_id"][rows],
-        near.where(np.lexsort((near.objects, near.rows))),
+        replace(near.where(kept), rows=own[kept]),
         present,
         matching.in_view[scored],
     )
@@ -234,20 +242,19 @@ def neighbours(
     The first is the last row whose column `name` is at most `values`. The second is the
     first row whose column is at least `values`.
     """
-    every = np.unique(np.concatenate([tracks[name], values]))
-    ranks, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
-    keys = tracks["track_id"] * len(every) + ranks
-    wanted = track_ids * len(every) + wanted
+    every = np.unique(tracks[name])
+    size = max(len(every), 1)
+    keys = tracks["track_id"] * size + np.searchsorted(every, tracks[name])
     order = np.argsort(keys, kind="stable")
     keys = np.append(keys[order], -1)
     order = np.append(order, -1)
+    not_after = track_ids * size + np.searchsorted(every, values, side="right") - 1
+    not_before = track_ids * size + np.searchsorted(every, values)
     at = (
-        np.searchsorted(keys[:-1], wanted, side="right") - 1,
-        np.searchsorted(keys[:-1], wanted),
+        np.searchsorted(keys[:-1], not_after, side="right") - 1,
+        np.searchsorted(keys[:-1], not_before),
     )
-    before, after = (
-        np.where(keys[k] // max(len(every), 1) == track_ids, order[k], -1) for k in at
-    )
+    before, after = (np.where(keys[k] // size == track_ids, order[k], -1) for k in at)
     return before, after
 
 

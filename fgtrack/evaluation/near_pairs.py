@@ -1,12 +1,17 @@
 """Tracks and true objects at ticks, their near pairs, and the assignment of tracks to objects."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.runs import NO_TRACK
+
+# Number of ticks whose pairs are processed together.
+_BLOCK_TICKS = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -32,8 +37,8 @@ class NearPairs:
         rows, objects = np.nonzero(distances_m < limit_m)
         return cls(rows, objects, distances_m[rows, objects], limit_m)
 
-    def where(self, chosen: BoolArray | IntArray) -> Self:
-        """Return the pairs selected by a mask, shape (k,), or by indices."""
+    def where(self, chosen: BoolArray | IntArray | slice) -> Self:
+        """Return the pairs selected by a mask, shape (k,), by indices or by a slice."""
         return replace(
             self,
             rows=self.rows[chosen],
@@ -96,6 +101,14 @@ class Scenes:
         distances_m[self.near.rows, self.near.objects] = self.near.distances_m
         return distances_m
 
+    def blocks(self, length: int = _BLOCK_TICKS) -> Iterator[slice]:
+        """Yield the indices of the near pairs of every `length` ticks."""
+        first_ticks = np.arange(0, len(self.present), length)
+        first_rows = np.searchsorted(self.tick_index, first_ticks)
+        edges = np.searchsorted(self.near.rows, first_rows).tolist()
+        for first, last in pairwise([*edges, len(self.near.rows)]):
+            yield slice(first, last)
+
     def assigned(self, scores: FloatArray, previous: IntArray) -> NearPairs:
         """Return the pairs with the largest sum of `scores` at each tick, see `assigned`."""
         return self.near.where(self.assigned_indices(scores, previous))
@@ -126,35 +139,50 @@ def assigned(
     pairs that are not allowed. `ids` and `tick_index` (rows,) are the track and the
     tick of each row. Allowed pairs of the tick `previous` (ticks,) stay.
     """
-    num_ticks = len(previous)
-    allowed = np.flatnonzero(scores > 0.0)
-    rows = near.rows[allowed]
-    objects = near.objects[allowed]
-    ticks = tick_index[rows]
-    # A tick is clear if each row has at most one allowed object, and each object one allowed row.
-    unclear = np.zeros(num_ticks, dtype=np.bool_)
-    per_row = np.bincount(rows, minlength=len(ids))
-    unclear[tick_index[per_row > 1]] = True
-    codes, times = np.unique(ticks * num_objects + objects, return_counts=True)
-    unclear[codes[times > 1] // max(num_objects, 1)] = True
     pair_of_row = np.full(len(ids), -1)
-    clear = ~unclear[ticks]
-    pair_of_row[rows[clear]] = allowed[clear]
-    in_order = np.argsort(tick_index, kind="stable")
-    edges = np.searchsorted(tick_index[in_order], np.arange(num_ticks + 1)).tolist()
-    by_tick = np.argsort(ticks, kind="stable")
-    pair_edges = np.searchsorted(ticks[by_tick], np.arange(num_ticks + 1)).tolist()
-    for k in np.flatnonzero(unclear).tolist():
-        last = int(previous[k])
-        before = in_order[edges[last] : edges[last + 1]] if last >= 0 else in_order[:0]
-        before = before[pair_of_row[before] >= 0]
-        track_of = np.full(num_objects, NO_TRACK)
-        track_of[near.objects[pair_of_row[before]]] = ids[before]
-        mine = allowed[by_tick[pair_edges[k] : pair_edges[k + 1]]]
-        of_tick = in_order[edges[k] : edges[k + 1]]
-        chosen = _best(near.where(mine), scores[mine], ids, of_tick, track_of)
-        pair_of_row[near.rows[mine[chosen]]] = mine[chosen]
+    rows, row_edges = _by_tick(tick_index, len(previous))
+    pairs, pair_edges = _by_tick(tick_index[near.rows], len(previous))
+    for first in range(0, len(previous), _BLOCK_TICKS):
+        last = min(first + _BLOCK_TICKS, len(previous))
+        mine = np.sort(pairs[pair_edges[first] : pair_edges[last]])
+        allowed = mine[scores[mine] > 0.0]
+        ticks = tick_index[near.rows[allowed]] - first
+        unclear = _unclear(near.where(allowed), ticks, num_objects)
+        clear = allowed[~unclear[ticks]]
+        pair_of_row[near.rows[clear]] = clear
+        for k in (first + np.flatnonzero(unclear)).tolist():
+            before = rows[:0]
+            if previous[k] >= 0:
+                at = int(previous[k])
+                before = rows[row_edges[at] : row_edges[at + 1]]
+            before = before[pair_of_row[before] >= 0]
+            track_of = np.full(num_objects, NO_TRACK)
+            track_of[near.objects[pair_of_row[before]]] = ids[before]
+            mine = allowed[ticks == k - first]
+            of_tick = rows[row_edges[k] : row_edges[k + 1]]
+            chosen = _best(near.where(mine), scores[mine], ids, of_tick, track_of)
+            pair_of_row[near.rows[mine[chosen]]] = mine[chosen]
     return pair_of_row[pair_of_row >= 0]
+
+
+def _by_tick(tick_index: IntArray, num_ticks: int) -> tuple[IntArray, IntArray]:
+    """Return indices by ascending tick, shape (n,), and the first of each tick, shape (num_ticks + 1,)."""
+    order = np.argsort(tick_index, kind="stable")
+    return order, np.searchsorted(tick_index[order], np.arange(num_ticks + 1))
+
+
+def _unclear(near: NearPairs, ticks: IntArray, num_objects: int) -> BoolArray:
+    """Mask of the ticks in which a row or an object has several pairs of `near`, shape (_BLOCK_TICKS,).
+
+    `ticks` (k,) is the tick of each pair.
+    """
+    unclear = np.zeros(_BLOCK_TICKS, dtype=np.bool_)
+    order = np.argsort(near.rows, kind="stable")
+    again = near.rows[order][1:] == near.rows[order][:-1]
+    unclear[ticks[order][1:][again]] = True
+    codes, times = np.unique(ticks * num_objects + near.objects, return_counts=True)
+    unclear[codes[times > 1] // max(num_objects, 1)] = True
+    return unclear
 
 
 def _best(

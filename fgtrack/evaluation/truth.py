@@ -20,6 +20,8 @@ _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
 # Number of states that are interpolated together.
 _BLOCK_ROWS = 1 << 15
+# Number of ticks at which all objects are interpolated together.
+_BLOCK_TICKS = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,8 @@ class TruePath:
     """x, y, yaw, speed and yaw rate at the stamps, shape (n, 5); NaN where the truth has no value."""
 
     @cached_property
-    def _periods_ns(self) -> IntArray:
-        return np.diff(self.stamps_ns)
-
-    @cached_property
     def _longest_gap_ns(self) -> float:
-        median_ns = float(np.median(self._periods_ns))
+        median_ns = float(np.median(np.diff(self.stamps_ns)))
         return max(_SHORTEST_GAP_NS, _GAP_PERIODS * median_ns)
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
@@ -53,13 +51,12 @@ class TruePath:
             return np.where(
                 (stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan
             )
-        periods_ns = self._periods_ns
         left = np.clip(
             np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1,
             0,
-            len(periods_ns) - 1,
+            len(self.stamps_ns) - 2,
         )
-        h_ns = periods_ns[left]
+        h_ns = self.stamps_ns[left + 1] - self.stamps_ns[left]
         u = (stamps_ns - self.stamps_ns[left]) / h_ns
         a = self.states[left]
         b = self.states[left + 1]
@@ -85,14 +82,26 @@ def true_paths(truth: Columns) -> list[TruePath]:
     If several rows have one stamp the last one counts. Rows without a position are
     ignored.
     """
-    rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
-    rows[~(np.abs(rows) <= LARGEST)] = np.nan
-    usable = np.isfinite(rows[:, :2]).all(axis=1) & (truth["object_id"] != EGO_ID)
+    ids = truth["object_id"]
+    usable = ids != EGO_ID
+    for name in TRUE_STATE[:2]:
+        usable &= np.abs(truth[name]) <= LARGEST
+    stamps_ns = truth["stamp_ns"]
+    rows_of = {}
     paths = []
-    for object_id in np.unique(truth["object_id"][usable]).tolist():
-        mine = np.flatnonzero(usable & (truth["object_id"] == object_id))[::-1]
-        stamps_ns, newest = np.unique(truth["stamp_ns"][mine], return_index=True)
-        paths.append(TruePath(object_id, stamps_ns, rows[mine[newest]]))
+    for object_id in np.unique(ids[usable]).tolist():
+        mine = np.flatnonzero(usable & (ids == object_id))[::-1]
+        distinct_ns, newest = np.unique(stamps_ns[mine], return_index=True)
+        rows_of[object_id] = mine[newest]
+        states = np.empty((len(newest), len(TRUE_STATE)))
+        paths.append(TruePath(object_id, distinct_ns, states))
+    # One column of a long table is in memory at a time.
+    for index, name in enumerate(TRUE_STATE):
+        values = truth[name]
+        for path in paths:
+            mine = values[rows_of[path.object_id]]
+            mine[~(np.abs(mine) <= LARGEST)] = np.nan
+            path.states[:, index] = mine
     return paths
 
 
@@ -139,13 +148,11 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     (ego.csv), or without a configured sensor, an object is visible whenever it has
     truth.
     """
-    positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
-    present = np.asarray(np.isfinite(positions_m).all(axis=-1))
     sensors = run.config.get("sensors") or {}
     poses = ego_states(run.tables["ego"], now_ns)[:, :3]
     names = np.unique(run.tables["updates"]["sensor"]).tolist()
     if np.isnan(poses).all() or not names or not sensors.keys() >= set(names):
-        return present
+        return present_objects(paths, now_ns)
     models = TypeAdapter(dict[str, SensorModel]).validate_python(
         {name: sensors[name] for name in names}
     )
@@ -154,10 +161,28 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
         float(ego.get("detection_origin_x_m", 0.0)),
         float(ego.get("detection_origin_y_m", 0.0)),
     )
-    positions_m[~present] = 0.0
-    poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
-    covered = [model.sees(positions_m, poses, origin_m) for model in models.values()]
-    return np.asarray(present & np.any(covered, axis=0))
+    seen = np.zeros((len(now_ns), len(paths)), dtype=np.bool_)
+    for first in range(0, len(now_ns), _BLOCK_TICKS):
+        block = slice(first, first + _BLOCK_TICKS)
+        positions_m = np.stack(
+            [path.at(now_ns[block])[:, :2] for path in paths], axis=1
+        )
+        present = np.isfinite(positions_m).all(axis=-1)
+        positions_m[~present] = 0.0
+        at = np.broadcast_to(poses[block, None], (*present.shape, 3))
+        covered = [model.sees(positions_m, at, origin_m) for model in models.values()]
+        seen[block] = present & np.any(covered, axis=0)
+    return seen
+
+
+def present_objects(paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
+    """Mask of the times at which an object of `paths` has truth, shape (n, objects)."""
+    present = np.empty((len(now_ns), len(paths)), dtype=np.bool_)
+    for first in range(0, len(now_ns), _BLOCK_TICKS):
+        block = slice(first, first + _BLOCK_TICKS)
+        for index, path in enumerate(paths):
+            present[block, index] = np.isfinite(path.at(now_ns[block])[:, 0])
+    return present
 
 
 def ego_states(ego: Columns, stamps_ns: IntArray) -> FloatArray:

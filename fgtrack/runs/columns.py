@@ -1,11 +1,16 @@
 """Columns of a table, which are selected at first use."""
 
-from collections.abc import Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.runs.schema import Column, column_type
+
+#: Largest column that is kept. To make such a column again for each of its rows would take minutes.
+_KEPT_BYTES = 1 << 23
 
 
 class Columns(Mapping[str, Column]):
@@ -47,17 +52,50 @@ class Columns(Mapping[str, Column]):
         return _Selection(self, rows)
 
 
-class _Selection(Columns):
-    """Rows of another table, whose columns are selected at first use.
+class MadeColumns(Columns):
+    """Columns that are made at first use.
+
+    A column of more than 8 MB is kept only while it is in use, so a long table needs the
+    memory of a few columns.
+    """
+
+    _in_use: WeakValueDictionary[str, Column]
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names = tuple(names)
+        self._columns = {}
+        self._in_use = WeakValueDictionary()
+
+    def __getitem__(self, name: str) -> Column:
+        values = self._in_use.get(name)
+        if values is None:
+            self._in_use[name] = values = read_only(self._made(name))
+            if values.nbytes <= _KEPT_BYTES:
+                self._columns[name] = values
+        return values
+
+    def __reduce__(self) -> tuple[type[Columns], tuple[Mapping[str, Column]]]:
+        return Columns, (dict(self),)
+
+    @property
+    @abstractmethod
+    def num_rows(self) -> int:
+        """Length of every column."""
+
+    @abstractmethod
+    def _made(self, name: str) -> Column:
+        """Return the column `name`."""
+
+
+class _Selection(MadeColumns):
+    """Rows of another table.
 
     A selection from a selection selects from the first table, so it makes no column
     that nobody uses.
     """
 
-    _table: Columns
-    _rows: IntArray
-
     def __init__(self, table: Columns, rows: BoolArray | IntArray) -> None:
+        super().__init__(table)
         index: IntArray = (
             np.flatnonzero(rows)
             if np.asarray(rows).dtype == np.bool_
@@ -68,17 +106,13 @@ class _Selection(Columns):
             table = table._table
         self._table = table
         self._rows = index
-        self._names = tuple(table)
-        self._columns = {}
-
-    def __getitem__(self, name: str) -> Column:
-        if name not in self._columns:
-            self._columns[name] = read_only(self._table[name][self._rows])
-        return self._columns[name]
 
     @property
     def num_rows(self) -> int:
         return len(self._rows)
+
+    def _made(self, name: str) -> Column:
+        return np.asarray(self._table[name][self._rows])
 
 
 def read_only(values: Column) -> Column:

@@ -3,10 +3,9 @@
 The module needs the package pyarrow (extra `parquet`).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +13,7 @@ import pyarrow.parquet as pq
 
 from fgtrack.core.errors import DataError
 from fgtrack.inputs.errors import one_line
-from fgtrack.runs.columns import Columns, read_only
+from fgtrack.runs.columns import Columns, MadeColumns
 from fgtrack.runs.rows import Row, text, text_header
 from fgtrack.runs.schema import (
     ADDED_COLUMNS,
@@ -29,8 +28,6 @@ from fgtrack.runs.schema import (
 #: Number of rows that are written together; a larger number compresses no better.
 _GROUP_ROWS = 1 << 16
 _BLOCK_ROWS = 1 << 13
-#: Largest column that is kept. To read such a column again for each of its rows would take minutes.
-_KEPT_BYTES = 1 << 23
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 #: A stream of bytes for each byte of a number compresses best: neighbours share exponents, but no digits.
 _ENCODINGS = {int: "DELTA_BINARY_PACKED", float: "BYTE_STREAM_SPLIT"}
@@ -102,21 +99,15 @@ class ParquetTable:
         self._num_rows = 0
 
 
-class ParquetColumns(Columns):
-    """Columns of a Parquet file, each of which is read when it is used.
-
-    A column of more than 8 MB is kept only while it is in use, so a long run needs the
-    memory of a few columns. Raises `DataError` where a column cannot be read.
-    """
+class ParquetColumns(MadeColumns):
+    """Columns of a Parquet file. Raises `DataError` where a column cannot be read."""
 
     def __init__(self, path: Path, table: str) -> None:
+        super().__init__(COLUMNS[table])
         self._path = path
         # The open file stays the file of this run where another run replaces it.
         self._file = pq.ParquetFile(path)
-        self._names = COLUMNS[table]
         self._written = frozenset(self._file.schema_arrow.names)
-        self._columns = {}
-        self._in_use: WeakValueDictionary[str, Column] = WeakValueDictionary()
         expected = [
             name
             for name in self._names
@@ -126,23 +117,12 @@ class ParquetColumns(Columns):
         if self._file.schema_arrow != pa.schema(zip(expected, types, strict=True)):
             raise ValueError(f"the columns must be {','.join(self._names)}")
 
-    def __getitem__(self, name: str) -> Column:
-        values = self._in_use.get(name)
-        if values is None:
-            self._in_use[name] = values = read_only(self._read(name))
-            if values.nbytes <= _KEPT_BYTES:
-                self._columns[name] = values
-        return values
-
-    def __reduce__(self) -> tuple[type[Columns], tuple[Mapping[str, Column]]]:
-        return Columns, (dict(self),)
-
     @property
     def num_rows(self) -> int:
         """Length of every column."""
         return int(self._file.metadata.num_rows)
 
-    def _read(self, name: str) -> Column:
+    def _made(self, name: str) -> Column:
         if name not in self._written:
             if name not in self._names:
                 raise KeyError(name)

@@ -5,18 +5,18 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
-import numpy.typing as npt
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import STATE_NAMES, TruthState
 from fgtrack.inputs.geodetic import LocalPlane
 from fgtrack.inputs.settings import Origin
 from fgtrack.inputs.stream import read_stream, read_truth_records
-from fgtrack.runs.columns import Columns
+from fgtrack.runs.columns import Columns, MadeColumns
 from fgtrack.runs.rows import Row, state_cells
 from fgtrack.runs.schema import COLUMNS, Column, column
 
@@ -26,6 +26,7 @@ _TYPE = np.dtype(
 )
 _PACK = struct.Struct(f"<{len(_KEYS)}q{len(STATE_NAMES)}d").pack
 _BLOCK_ROWS = 1 << 15
+_CELL_BYTES = 8
 
 
 class TruthHash:
@@ -52,7 +53,7 @@ class TruthHash:
         return {"rows": self.num_rows, "sha256": self._sha.hexdigest()}
 
 
-class RecordedTruth(Columns):
+class RecordedTruth(MadeColumns):
     """Table `truth` of a run, which is read from its recording at first use.
 
     Runs of the same recording share the columns. Raises `DataError` where the recording
@@ -66,8 +67,7 @@ class RecordedTruth(Columns):
         meta: Mapping[str, Any],
         origin: Callable[[], Origin | None],
     ) -> None:
-        self._names = COLUMNS["truth"]
-        self._columns = {}
+        super().__init__(COLUMNS["truth"])
         self._folder = folder
         self._recording = recording
         self._given = str((meta.get("input") or {}).get("path", "its recording"))
@@ -76,18 +76,15 @@ class RecordedTruth(Columns):
         self._origin = origin
         self._shared: Columns | None = None
 
-    def __getitem__(self, name: str) -> Column:
-        if self._shared is None:
-            self._shared = self._read()
-        return self._shared[name]
-
-    def __reduce__(self) -> tuple[type[Columns], tuple[Mapping[str, Column]]]:
-        return Columns, (dict(self),)
-
     @property
     def num_rows(self) -> int:
         """Length of every column."""
         return self._num_rows
+
+    def _made(self, name: str) -> Column:
+        if self._shared is None:
+            self._shared = self._read()
+        return self._shared[name]
 
     def _read(self) -> Columns:
         """Return the columns, after a comparison of their hash with the hash of the replay."""
@@ -101,13 +98,11 @@ class RecordedTruth(Columns):
             return known
         for read in (self._fast_rows, self._validated_rows):
             try:
-                rows, sha256 = _table(read(self._recording), self._num_rows)
+                table = _FileOfTruth(read(self._recording), self._num_rows)
             except (TypeError, ValueError):  # a value that the reader must convert
                 continue
-            if sha256 == self._sha256:
-                _READ[key] = table = Columns(
-                    {name: column(name, rows[name]) for name in self._names}
-                )
+            if table.sha256 == self._sha256:
+                _READ[key] = table
                 return table
         raise DataError(
             f"{self._folder}: its truth is in {self._recording}, which has changed since the replay: "
@@ -129,15 +124,38 @@ class RecordedTruth(Columns):
 _READ: WeakValueDictionary[tuple[Path, str], Columns] = WeakValueDictionary()
 
 
-def _table(rows: Iterable[Row], num_rows: int) -> tuple[npt.NDArray[Any], str]:
-    """Return the first `num_rows` rows as a structured array, and their SHA-256."""
-    table = np.empty(num_rows, dtype=_TYPE)
-    sha = hashlib.sha256()
-    first = 0
-    left = islice(rows, num_rows)
-    while block := list(islice(left, _BLOCK_ROWS)):
-        last = first + len(block)
-        table[first:last] = np.array(block, dtype=_TYPE)
-        sha.update(table[first:last].tobytes())
-        first = last
-    return table[:first], sha.hexdigest()
+class _FileOfTruth(MadeColumns):
+    """The first `num_rows` true states in a temporary file, column after column, and their SHA-256.
+
+    To parse an hour again for each use would take minutes, and to keep it takes 250 MB.
+    """
+
+    def __init__(self, rows: Iterable[Row], num_rows: int) -> None:
+        super().__init__(COLUMNS["truth"])
+        self._num_rows = num_rows
+        self._file = TemporaryFile()  # noqa: SIM115
+        sha = hashlib.sha256()
+        first = 0
+        left = islice(rows, num_rows)
+        while block := list(islice(left, _BLOCK_ROWS)):
+            cells = np.array(block, dtype=_TYPE)
+            sha.update(cells.tobytes())
+            for name in self._names:
+                self._file.seek(self._position(name) + first * _CELL_BYTES)
+                self._file.write(cells[name].tobytes())
+            first += len(block)
+        self.sha256 = sha.hexdigest()
+
+    @property
+    def num_rows(self) -> int:
+        """Length of every column."""
+        return self._num_rows
+
+    def _made(self, name: str) -> Column:
+        self._file.seek(self._position(name))
+        values = np.fromfile(self._file, _TYPE[name], self._num_rows)
+        return column(name, values)
+
+    def _position(self, name: str) -> int:
+        """Return the first byte of a column in the file."""
+        return self._names.index(name) * self._num_rows * _CELL_BYTES

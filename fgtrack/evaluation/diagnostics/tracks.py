@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.diagnostic import Diagnostic
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.diagnostics.noise import FEWEST
 from fgtrack.evaluation.diagnostics.outcomes import USED
 from fgtrack.evaluation.matching import confirmed
@@ -116,20 +116,19 @@ def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
     A break is a track that begins near the end of another track, in time and position.
     """
     tracks = run.tables["tracks"]
-    tracks = tracks.where(
-        np.isin(tracks["track_id"], tracks["track_id"][confirmed(tracks)])
+    ids = tracks["track_id"]
+    known = np.unique(ids[confirmed(tracks)])
+    births = _first_rows(ids, known)
+    ends = len(ids) - 1 - _first_rows(ids[::-1], known)
+    first, last = tracks.where(births), tracks.where(ends)
+    start_ns = int(first["now_ns"].min()) if len(known) else 0
+    born_s = (first["now_ns"] - start_ns) / NS_PER_S
+    ended_s = (last["now_ns"] - start_ns) / NS_PER_S
+    births_m, ends_m = (
+        np.stack([each["x_m"], each["y_m"]], axis=-1) for each in (first, last)
     )
-    births = np.unique(tracks["track_id"], return_index=True)[1]
-    ends = (
-        tracks.num_rows - 1 - np.unique(tracks["track_id"][::-1], return_index=True)[1]
-    )
-    born_s, ended_s = (
-        (tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S
-        for each in (births, ends)
-    )
-    positions_m = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
-    speed_mps = tracks["speed_mps"][ends]
-    velocities_mps = cartesian(np.stack([tracks["yaw_rad"][ends], speed_mps], axis=-1))
+    speed_mps = last["speed_mps"]
+    velocities_mps = cartesian(np.stack([last["yaw_rad"], speed_mps], axis=-1))
     free = np.ones(len(births), dtype=bool)  # tracks without a continuation
     num_breaks = 0
     for k in np.argsort(born_s, kind="stable").tolist():
@@ -141,13 +140,17 @@ def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
             & (gap_s <= _GAP_S)
         )
         before = np.flatnonzero(free & late)
-        expected_m = (
-            positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
-        )
-        distance_m = np.linalg.norm(positions_m[births[k]] - expected_m, axis=-1)
+        expected_m = ends_m[before] + velocities_mps[before] * gap_s[before, None]
+        distance_m = np.linalg.norm(births_m[k] - expected_m, axis=-1)
         way_m = np.abs(speed_mps[before] * gap_s[before])
         near = distance_m <= _NEAR_M + _DEPARTURE * way_m
         if near.any():
             free[before[near][distance_m[near].argmin()]] = False
             num_breaks += 1
     return ended_s - born_s, num_breaks
+
+
+def _first_rows(ids: IntArray, wanted: IntArray) -> IntArray:
+    """Return the first row of each id in `wanted`, all of which are in `ids`."""
+    every, first = np.unique(ids, return_index=True)
+    return np.asarray(first[np.searchsorted(every, wanted)])

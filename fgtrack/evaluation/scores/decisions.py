@@ -222,14 +222,12 @@ def _not_after(
     keys: IntArray, times_ns: IntArray, event_keys: IntArray, event_ns: IntArray
 ) -> IntArray:
     """Return the number of events with the key of each state at or before its time, shape (p,)."""
-    _, key = np.unique(np.concatenate([keys, event_keys]), return_inverse=True)
-    distinct_ns, rank = np.unique(
-        np.concatenate([times_ns, event_ns]), return_inverse=True
-    )
-    codes = key * len(distinct_ns) + rank
-    events = np.sort(codes[len(keys) :])
-    codes = codes[: len(keys)]
-    firsts = codes - rank[: len(keys)]
-    return np.searchsorted(events, codes, side="right") - np.searchsorted(
-        events, firsts
-    )
+    distinct, key = np.unique(event_keys, return_inverse=True)
+    distinct_ns, rank = np.unique(event_ns, return_inverse=True)
+    size = len(distinct_ns) + 1
+    events = np.sort(key * size + rank)
+    firsts = np.searchsorted(distinct, keys)
+    known = np.isin(keys, distinct)
+    until = firsts * size + np.searchsorted(distinct_ns, times_ns, side="right")
+    counts = np.searchsorted(events, until) - np.searchsorted(events, firsts * size)
+    return np.where(known, counts, 0)

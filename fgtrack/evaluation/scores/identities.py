@@ -57,14 +57,23 @@ def hota(scenes: Scenes, similarity: FloatArray) -> dict[str, float]:
     num_rows = len(scenes.tick_index)
     if not num_true:
         return dict.fromkeys(("hota", "deta", "assa"), math.nan)
-    near = scenes.near
     ids, track_of_row = np.unique(scenes.track_ids, return_inverse=True)
-    codes, identity_of_pair = np.unique(
-        near.objects * max(len(ids), 1) + track_of_row[near.rows], return_inverse=True
+    blocks = list(scenes.blocks())
+    codes = np.unique(
+        np.concatenate(
+            [
+                np.unique(_codes(scenes, track_of_row, len(ids), block))
+                for block in blocks
+            ]
+        )
     )
-    together = np.bincount(
-        identity_of_pair, _shares(scenes, similarity), minlength=len(codes)
-    )
+    identity_of_pair = np.empty(len(similarity), dtype=np.int32)
+    together = np.zeros(len(codes))
+    for block in blocks:
+        mine = np.searchsorted(codes, _codes(scenes, track_of_row, len(ids), block))
+        identity_of_pair[block] = mine
+        shares = _shares(scenes, similarity[block], block)
+        together += np.bincount(mine, shares, minlength=len(codes))
     # Ticks with the object plus ticks with the track, of each pair of identities.
     either = (
         scenes.present.sum(axis=0)[codes // max(len(ids), 1)]
@@ -92,14 +101,28 @@ def hota(scenes: Scenes, similarity: FloatArray) -> dict[str, float]:
     }
 
 
-def _shares(scenes: Scenes, similarity: FloatArray) -> FloatArray:
-    """Return the similarity of each near pair over the similarities of its row and its object at the tick."""
+def _codes(
+    scenes: Scenes, track_of_row: IntArray, num_tracks: int, block: slice
+) -> IntArray:
+    """Return a number for the object and the track of each near pair of `block`."""
     near = scenes.near
+    return np.asarray(
+        near.objects[block] * max(num_tracks, 1) + track_of_row[near.rows[block]]
+    )
+
+
+def _shares(scenes: Scenes, similarity: FloatArray, block: slice) -> FloatArray:
+    """Return the similarity of each near pair over the similarities of its row and its object at the tick.
+
+    `similarity` is that of the pairs in `block`, which contains whole ticks.
+    """
+    rows, objects = scenes.near.rows[block], scenes.near.objects[block]
+    _, row = np.unique(rows, return_inverse=True)
     _, object_at_tick = np.unique(
-        scenes.tick_index[near.rows] * scenes.present.shape[1] + near.objects,
+        scenes.tick_index[rows] * scenes.present.shape[1] + objects,
         return_inverse=True,
     )
-    of_row = np.bincount(near.rows, similarity)[near.rows]
+    of_row = np.bincount(row, similarity)[row]
     of_object = np.bincount(object_at_tick, similarity)[object_at_tick]
     either = of_row + of_object - similarity
     return np.divide(

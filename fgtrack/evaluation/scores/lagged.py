@@ -72,7 +72,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     if (smoothed["kind"] == "final").any():
         parts[WINDOW] = smoothed.where(smoothed["kind"] == "final")
     present = matching.tracks.where(matching.paired)
-    truth = matching.true_states[matching.paired]
+    truth = matching.truth_of(matching.paired)
     errors = _moments(state_errors(present, truth))
     result = [
         LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)
@@ -81,7 +81,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         states, truth, rows = _with_truth(run, matching, every)
         present = matching.tracks.where(rows)
         lagged_errors = state_errors(states, truth)
-        present_errors = state_errors(present, matching.true_states[rows])
+        present_errors = state_errors(present, matching.truth_of(rows))
         squares = np.square(
             np.stack(
                 [lagged_errors["position_m"], present_errors["position_m"]], axis=-1

@@ -7,6 +7,7 @@ Transactions on Signal Processing 68, 2020, section IV (linear program), with p 
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import LinearConstraint, milp
@@ -52,13 +53,13 @@ def t_gospa(
     if not num_ticks:
         return dict.fromkeys(("rms_m", *names, "windows"), math.nan)
     scenes.near.check(c_m)
-    near = scenes.near.where(scenes.near.distances_m < c_m)
     length = WINDOW_TICKS if num_ticks > MOST_TICKS else num_ticks
-    window = scenes.tick_index[near.rows] // length
-    parts = [
-        _assignment(scenes, near.where(window == number), c_m, switch_m)
-        for number in np.unique(window).tolist()
-    ]
+    parts = []
+    for block in scenes.blocks(length):
+        near = scenes.near.where(block)
+        near = near.where(near.distances_m < c_m)
+        if len(near.rows):
+            parts.append(_assignment(scenes, near, c_m, switch_m))
     localisation_m2, pairs, changes = np.sum(
         np.reshape(parts, (-1, 3)), axis=0
     ).tolist()
@@ -135,16 +136,28 @@ def _stretches(close: BoolArray, pairs: IntArray) -> IntArray:
     competing close pairs is a stretch by itself. `close` (k, n) marks the close pairs.
     """
     objects, tracks = (np.unique(of, return_inverse=True)[1] for of in pairs)
+
+    def competes(chosen: BoolArray) -> bool:
+        """True if two of the `chosen` pairs share an object or a track."""
+        most = np.bincount(objects[chosen]).max() + np.bincount(tracks[chosen]).max()
+        return bool(most > 2)
+
+    changes = np.flatnonzero((close[1:] != close[:-1]).any(axis=1)) + 1
+    edges = [0, *changes.tolist(), len(close)]
     number = 0
     stretch = np.empty(len(close), dtype=np.int64)
     together = close[0]
-    for k, now in enumerate(close):
-        joined = together | now
-        if np.bincount(objects[joined]).max() + np.bincount(tracks[joined]).max() > 2:
-            number += k > 0
-            joined = now
-        stretch[k] = number
-        together = joined
+    for first, last in pairwise(edges):  # ticks in a row with the same close pairs
+        now = close[first]
+        if competes(together | now):
+            number += first > 0
+            together = now
+        together = together | now
+        if competes(now):
+            stretch[first:last] = number + np.arange(last - first)
+            number += last - first - 1
+        else:
+            stretch[first:last] = number
     return stretch
 
 

@@ -51,7 +51,7 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
         cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1))
     )
     known = np.isfinite(truth[:, 0])
-    at_stamp = published - matching.true_states[rows, :2]
+    at_stamp = published - matching.truth_of(rows)[:, :2]
     values = {
         ASKED: np.linalg.norm(at_stamp, axis=-1)[known],
         READY: np.linalg.norm(published - truth, axis=-1)[known],
