@@ -94,6 +94,9 @@ class _Selection(MadeColumns):
     that nobody uses.
     """
 
+    _table: Columns
+    _rows: IntArray
+
     def __init__(self, table: Columns, rows: BoolArray | IntArray) -> None:
         super().__init__(table)
         index: IntArray = (
