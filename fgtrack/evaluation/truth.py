@@ -18,6 +18,7 @@ from fgtrack.runs import Columns, Run
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
+_AROUND_NS = 60 * NS_PER_S
 # Number of states that are interpolated together.
 _BLOCK_ROWS = 1 << 15
 # Number of ticks at which all objects are interpolated together.
@@ -103,6 +104,17 @@ def true_paths(truth: Columns) -> list[TruePath]:
             mine[~(np.abs(mine) <= LARGEST)] = np.nan
             path.states[:, index] = mine
     return paths
+
+
+def paths_around(run: Run, times_ns: IntArray) -> list[TruePath]:
+    """Return the paths of the true objects of `run` from a minute before `times_ns` (n,) to a minute after them."""
+    truth = run.tables["truth"]
+    if not len(times_ns):
+        return []
+    stamps_ns = truth["stamp_ns"]
+    near = stamps_ns >= times_ns.min() - _AROUND_NS
+    near &= stamps_ns <= times_ns.max() + _AROUND_NS
+    return true_paths(truth.where(near))
 
 
 def states_of(

@@ -10,7 +10,7 @@ from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.runs.schema import Column, column_type
 
 #: Largest column that is kept. To make such a column again for each of its rows would take minutes.
-_KEPT_BYTES = 1 << 23
+KEPT_BYTES = 1 << 23
 
 
 class Columns(Mapping[str, Column]):
@@ -70,7 +70,7 @@ class MadeColumns(Columns):
         values = self._in_use.get(name)
         if values is None:
             self._in_use[name] = values = read_only(self._made(name))
-            if values.nbytes <= _KEPT_BYTES:
+            if values.nbytes <= KEPT_BYTES:
                 self._columns[name] = values
         return values
 
@@ -119,7 +119,9 @@ class _Selection(MadeColumns):
 
 
 def read_only(values: Column) -> Column:
-    """Return a view of `values` that cannot be written."""
+    """Return `values` if they cannot be written, otherwise a view of them that cannot be written."""
+    if not values.flags.writeable:
+        return values
     view = values.view()
     view.flags.writeable = False
     return view

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, finalize
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from fgtrack.core.types import STATE_NAMES, TruthState
 from fgtrack.inputs.geodetic import LocalPlane
 from fgtrack.inputs.settings import Origin
 from fgtrack.inputs.stream import read_stream, read_truth_records
-from fgtrack.runs.columns import Columns, MadeColumns
+from fgtrack.runs.columns import KEPT_BYTES, Columns, MadeColumns
 from fgtrack.runs.rows import Row, state_cells
 from fgtrack.runs.schema import COLUMNS, Column, column
 
@@ -145,6 +145,10 @@ class _FileOfTruth(MadeColumns):
                 self._file.write(cells[name].tobytes())
             first += len(block)
         self.sha256 = sha.hexdigest()
+        finalize(self, self._file.close)
+        if num_rows * _CELL_BYTES <= KEPT_BYTES:
+            dict(self)  # short columns stay in memory, so many runs need no open files
+            self._file.close()
 
     @property
     def num_rows(self) -> int:

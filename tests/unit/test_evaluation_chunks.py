@@ -97,7 +97,7 @@ def test_pairs_stay_across_the_border_of_a_chunk(
 def test_a_large_column_of_a_selection_is_kept_only_while_it_is_in_use(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fgtrack.runs.columns._KEPT_BYTES", 100)
+    monkeypatch.setattr("fgtrack.runs.columns.KEPT_BYTES", 100)
     table = Columns({"x_m": np.arange(1000.0), "tick": np.arange(1000)})
     large, small = table.where(np.arange(500)), table.where(np.arange(5))
     first = large["x_m"]
