@@ -5,6 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from fgtrack.core.types import IntArray
 from fgtrack.tracking.decisions.ranking import (
     LARGEST_LOSS,
     Gains,
@@ -15,18 +16,27 @@ from fgtrack.tracking.decisions.ranking import (
 Pair = tuple[int, int, float]
 
 
-def ranked(pairs: list[Pair], most: int) -> list[Ranked]:
+def gains_of(pairs: list[Pair], num_tracks: int, num_candidates: int) -> Gains:
+    """Return the gains of pairs of tracks and candidates."""
+    pairs = sorted(pairs)
+    tracks, candidates, values = (
+        np.array([each[k] for each in pairs]) for k in range(3)
+    )
+    first = np.searchsorted(tracks, np.arange(num_tracks + 1))
+    return Gains(first, candidates.astype(int), values.astype(float), num_candidates)
+
+
+def ranked(pairs: list[Pair], most: int) -> tuple[Gains, Ranked]:
     """Return the best assignments of pairs of five tracks and five candidates."""
-    tracks, candidates, values = (np.array(each) for each in zip(*pairs, strict=True))
-    problem = Gains.of(tracks, candidates, values, 5, 5)
-    return best_assignments([(0.0, problem)], most)
+    gains = gains_of(pairs, 5, 5)
+    return gains, best_assignments(gains, [(0.0, np.arange(5))], most)
 
 
-def taken_pairs(own: Ranked) -> frozenset[tuple[int, int]]:
+def taken_pairs(gains: Gains, pairs: IntArray) -> frozenset[tuple[int, int]]:
     return frozenset(
-        (track, candidate)
-        for track, candidate in enumerate(own.candidates.tolist())
-        if candidate >= 0
+        (track, int(gains.candidates[pair]))
+        for track, pair in enumerate(pairs.tolist())
+        if pair >= 0
     )
 
 
@@ -63,26 +73,19 @@ def test_the_best_assignments_are_those_of_a_search(seed: int) -> None:
     ]
     expected = every_assignment(pairs)
     expected = [each for each in expected if each[0] > expected[0][0] - LARGEST_LOSS]
-    found = ranked(pairs, most=6)
-    assert len(found) == min(6, len(expected))
-    for own, (gain, taken) in zip(found, expected, strict=False):
-        assert own.gain == pytest.approx(gain)
-        assert taken_pairs(own) == taken
-
-
-def test_the_order_of_the_pairs_does_not_matter() -> None:
-    rng = np.random.default_rng(3)
-    pairs = [(i, j, float(rng.normal())) for i in range(5) for j in range(5)]
-    shuffled = [pairs[k] for k in rng.permutation(len(pairs))]
-    own, other = (ranked(each, 8) for each in (pairs, shuffled))
-    assert [taken_pairs(each) for each in own] == [taken_pairs(each) for each in other]
+    gains, found = ranked(pairs, most=6)
+    assert len(found.gains) == min(6, len(expected))
+    for total, own, (gain, taken) in zip(
+        found.gains.tolist(), found.pairs, expected, strict=False
+    ):
+        assert total == pytest.approx(gain)
+        assert taken_pairs(gains, own) == taken
 
 
 def test_without_pairs_all_tracks_are_missed() -> None:
-    nothing = np.zeros(0, dtype=np.int64)
-    [only] = best_assignments([(0.0, Gains.of(nothing, nothing, np.zeros(0), 2, 3))], 3)
-    assert only.gain == 0.0
-    assert only.candidates.tolist() == [-1, -1]
+    found = best_assignments(gains_of([], 2, 3), [(0.0, np.arange(2))], 3)
+    assert found.gains.tolist() == [0.0]
+    assert found.pairs.tolist() == [[-1, -1]]
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -90,22 +93,32 @@ def test_the_best_assignments_of_several_problems_are_ranked_together(
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    problems, expected = [], []
+    problems, every, expected = [], [], []
     for number in range(3):
         gain = float(rng.normal())
-        pairs = [
-            (i, j, float(rng.normal(1.0, 4.0))) for i in range(3) for j in range(3)
-        ]
-        tracks, candidates, values = (
-            np.array(each) for each in zip(*pairs, strict=True)
-        )
-        problems.append((gain, Gains.of(tracks, candidates, values, 3, 3)))
+        tracks = range(3 * number, 3 * number + 3)
+        pairs = [(i, j, float(rng.normal(1.0, 4.0))) for i in tracks for j in range(3)]
+        every += pairs
+        problems.append((gain, np.array(tracks)))
         expected += [
             (gain + own, number, taken) for own, taken in every_assignment(pairs)
         ]
     expected = sorted(expected, key=lambda each: -each[0])[:5]
     least = expected[0][0] - LARGEST_LOSS
-    found = best_assignments(problems, 5)
+    gains = gains_of(every, 9, 3)
+    found = best_assignments(gains, problems, 5)
     assert [
-        (pytest.approx(each.gain), each.problem, taken_pairs(each)) for each in found
+        (pytest.approx(total), problem, taken_pairs(gains, pairs))
+        for total, problem, pairs in zip(
+            found.gains.tolist(), found.problems.tolist(), found.pairs, strict=True
+        )
     ] == [each for each in expected if each[0] > least]
+
+
+def test_problems_may_share_tracks() -> None:
+    gains = gains_of([(0, 0, 2.0), (1, 0, 1.2), (1, 1, 1.0)], 2, 2)
+    problems = [(0.0, np.array([0])), (0.5, np.array([0, 1]))]
+    found = best_assignments(gains, problems, 3)
+    assert found.gains.tolist() == pytest.approx([3.5, 2.5, 2.0])
+    assert found.problems.tolist() == [1, 1, 0]
+    assert found.pairs.tolist() == [[0, 2], [0, -1], [0, -2]]

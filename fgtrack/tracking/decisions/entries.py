@@ -128,6 +128,8 @@ class Entry:
     """Numbers of the tracks that the candidates would start."""
     number: int = 0
     """Number of the list in the order of arrival."""
+    free: tuple[FloatArray, FloatArray] | None = None
+    """Log-density of the candidates without a track (m,), and the probability that they start one (m,), once known."""
 
     _starts: dict[int, Start | None] = field(default_factory=dict)
     _states: dict[int, tuple[FloatArray, FloatArray] | None] = field(

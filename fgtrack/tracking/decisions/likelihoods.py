@@ -1,11 +1,12 @@
 """The table of log-likelihoods of a list: each candidate with each track, as clutter, and as a new object."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
 from fgtrack.tracking.association import near, reaches_m
@@ -19,12 +20,13 @@ from fgtrack.tracking.objects import differ
 
 _GATE_PROBABILITY = 0.99999
 _LEAST_GAIN = -LARGEST_LOSS
-_LARGEST_LOG_RATIO = 500.0
+_FARTHEST_M = 5000.0
+_KERNELS = "fgtrack.tracking.decisions.step_kernels"
 
 
 @dataclass(frozen=True)
 class Table:
-    """Log-likelihoods of a list with m candidates, for n tracks."""
+    """Log-likelihoods of a list with m candidates, for n tracks and p pairs."""
 
     gains: Gains
     """Log-likelihood ratios of pairs to a missed track and a candidate without a track."""
@@ -36,10 +38,10 @@ class Table:
     """Probability that each track is detected, if it exists, shape (n,)."""
     in_view: BoolArray
     """True for each track that the list would show, shape (n,)."""
-    ratios: Mapping[tuple[int, int], float]
-    """Likelihood ratio of each pair (track, candidate), if the track is detected, to a candidate without a track."""
-    jumps: set[tuple[int, int]]
-    """Pairs (track, candidate) whose correlated error is probably new."""
+    ratios: FloatArray
+    """Likelihood ratio of each pair, if the track is detected, to a candidate without a track, shape (p,)."""
+    jumps: BoolArray
+    """True for each pair whose correlated error is probably new, shape (p,)."""
 
 
 def likelihoods(
@@ -47,64 +49,74 @@ def likelihoods(
     entry: Entry,
     in_view: BoolArray,
     unseen: Sequence[Unseen],
-    returns: FloatArray,
+    returns: FloatArray | None,
     rules: Rules,
 ) -> Table:
-    """Return the log-likelihoods of a list."""
-    sensor = entry.sensor
+    """Return the log-likelihoods of a list. `returns` (m,) are the densities of second returns, None for 0."""
+    sensor, num_candidates = entry.sensor, len(entry.candidates)
     detectable = sensor.detection_probability * nodes.visible[:, entry.index]
-    now = nodes.existed * nodes.alive
-    misses = sensor.gives_position and sensor.scan and entry.batch.last
-    missed = (
-        np.where(in_view, 1.0 - now * detectable, 1.0) if misses else np.ones(len(now))
-    )
+    shows_misses = sensor.gives_position and sensor.scan and entry.batch.last
     log_free, born = _free(entry, unseen, returns, rules)
-    rows, columns, log_densities, jumps = _pairs(nodes, entry)
-    more = _described(nodes, entry, rows, columns)
-    log_ratios = log_densities + more - log_free[columns]
-    gains = (
-        np.log(np.maximum(now * detectable, 1e-300))[rows]
-        - np.log(missed)[rows]
-        + log_ratios
+    rows, columns, densities, jumps = _pairs(nodes, entry)
+    if entry.is_described:
+        densities = densities + _described(nodes, entry, rows, columns)
+    first, candidates, gains, ratios, is_jump, log_missed = kernels(_KERNELS).tabulate(
+        rows,
+        columns,
+        densities,
+        jumps,
+        log_free,
+        nodes.existed * nodes.alive,
+        detectable,
+        in_view,
+        shows_misses,
+        num_candidates,
+        _LEAST_GAIN,
     )
-    likely = gains > _LEAST_GAIN
-    pairs = zip(rows[likely].tolist(), columns[likely].tolist(), strict=True)
-    ratios = np.exp(np.minimum(log_ratios[likely], _LARGEST_LOG_RATIO)).tolist()
     return Table(
-        Gains.of(
-            rows[likely],
-            columns[likely],
-            gains[likely],
-            len(nodes.roots),
-            len(entry.candidates),
-        ),
-        np.log(missed),
+        Gains(first, candidates, gains, num_candidates),
+        log_missed,
         born,
         detectable,
-        in_view & misses,
-        dict(zip(pairs, ratios, strict=True)),
-        set(zip(rows[jumps].tolist(), columns[jumps].tolist(), strict=True)),
+        in_view & shows_misses,
+        ratios,
+        is_jump,
     )
 
 
 def _free(
     entry: Entry,
     unseen: Sequence[Unseen],
-    returns: FloatArray,
+    returns: FloatArray | None,
     rules: Rules,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the log-density of candidates without a track (m,), and the probability that they start a track (m,).
 
     A candidate without a track is clutter, a second return of a track, or a new object.
     """
-    clutter = np.exp(entry.log_clutter)
-    if rules.prior is None:
-        new = rules.birth_odds * np.exp(entry.log_clutter + entry.scores)
-    else:
-        new = densities_of(entry, unseen).sum(axis=0)
-    new = np.where(entry.may_start, new, 0.0)
+    if returns is None and rules.prior is None:
+        if entry.free is None:
+            entry.free = _sum_of(entry, _new(entry, rules), 0.0)
+        return entry.free
+    new = _new(entry, rules)
+    if rules.prior is not None:
+        shown = densities_of(entry, unseen).sum(axis=0)
+        new = np.where(entry.may_start, shown, 0.0)
+    return _sum_of(entry, new, 0.0 if returns is None else returns)
+
+
+def _new(entry: Entry, rules: Rules) -> FloatArray:
+    """Return the density of new objects at each candidate, without a prior of their states, shape (m,)."""
+    density = rules.birth_odds * np.exp(entry.log_clutter + entry.scores)
+    return np.where(entry.may_start, density, 0.0)
+
+
+def _sum_of(
+    entry: Entry, new: FloatArray, returns: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the result of `_free` for densities of new objects and of second returns."""
     starts = np.where(entry.may_start, new + returns, 0.0)
-    total = clutter + np.maximum(starts, returns)
+    total = np.exp(entry.log_clutter) + np.maximum(starts, returns)
     return np.log(total), starts / total
 
 
@@ -116,16 +128,16 @@ def _pairs(
     A pair keeps the correlated error of the track's last detection. With the probability of a jump the error is new.
     """
     m = len(entry.candidates)
-    if not m or not len(nodes.roots):
+    if not m or not len(nodes):
         nothing = np.zeros(0, dtype=np.int64)
         return nothing, nothing, np.zeros(0), np.zeros(0, dtype=bool)
     new = renewed(nodes.means, nodes.covariances, entry)
     states = StatesAt((), nodes.means, nodes.covariances)
-    reach_m = reaches_m(entry.groups, states, _GATE_PROBABILITY, 5000.0)
+    reach_m = reaches_m(entry.groups, states, _GATE_PROBABILITY, _FARTHEST_M)
     if new is not None:
         reach_m = np.maximum(
             reach_m,
-            reaches_m(entry.groups, StatesAt((), *new), _GATE_PROBABILITY, 5000.0),
+            reaches_m(entry.groups, StatesAt((), *new), _GATE_PROBABILITY, _FARTHEST_M),
         )
     pairs = near(entry.candidates, nodes.means, reach_m)
     columns, rows = pairs.rows, pairs.columns
@@ -144,8 +156,6 @@ def _described(
 ) -> FloatArray:
     """Return the log-likelihood ratio of classes and identities of each pair."""
     result = np.zeros(len(rows))
-    if not entry.is_described:
-        return result
     wrong = entry.sensor.wrong_id_probability
     weight = math.log((1.0 - wrong) / wrong)
     own = entry.descriptions

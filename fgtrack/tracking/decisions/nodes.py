@@ -7,6 +7,24 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.motion import MotionModel
+from fgtrack.tracking.decisions.columns import (
+    ALIVE,
+    BELIEVED,
+    COASTS,
+    COUNT,
+    EXISTED,
+    FIRST_X_M,
+    FIRST_Y_M,
+    HAZARD_HZ,
+    HITS,
+    IS_CONFIRMED,
+    MISSES,
+    NUM_NUMBERS,
+    NUM_PROBABILITIES,
+    OWN,
+    ROOT,
+    SENSOR,
+)
 from fgtrack.tracking.decisions.entries import Description, Entry
 from fgtrack.tracking.decisions.unseen import Unseen
 
@@ -20,35 +38,81 @@ class Nodes:
 
     means: FloatArray
     covariances: FloatArray
-    existed: FloatArray
-    """Probability that the object has ever existed."""
-    believed: FloatArray
-    """Probability that the object has ever existed, if the detections of the track may also be clutter."""
-    alive: FloatArray
-    """Probability that the object still exists, if it has ever existed."""
     visible: FloatArray
     """Probability that the object is visible to each sensor, shape (n, sensors)."""
-    is_confirmed: BoolArray
-    has_travelled: BoolArray
-    first_m: FloatArray
-    """First positions, shape (n, 2)."""
-    roots: IntArray
-    """Numbers of the tracks: of the detections that started them."""
-    hazards_hz: FloatArray
-    """Rates at which the probability of existence decays until the next list."""
-    hits: IntArray
-    """Numbers of detections."""
-    counts: IntArray
-    """Numbers of detections by `sensors`."""
-    misses: IntArray
-    """Numbers of lists of `sensors` in whose view the object was, without a detection."""
-    sensors: IntArray
-    """Numbers of the sensors that started the tracks."""
-    own: FloatArray
-    """Probability that the track is no second return of another track."""
-    coasts: BoolArray
-    """True for each track that was missed by the last list that could show it."""
+    probabilities: FloatArray
+    """Numbers by the columns of `fgtrack.tracking.decisions.columns`, shape (n, 7)."""
+    numbers: IntArray
+    """Whole numbers by the columns of `fgtrack.tracking.decisions.columns`, shape (n, 8)."""
     descriptions: tuple[Description, ...]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def existed(self) -> FloatArray:
+        """Probability that the object has ever existed."""
+        return self.probabilities[:, EXISTED]
+
+    @property
+    def believed(self) -> FloatArray:
+        """Probability that the object has ever existed, if the detections of the track may also be clutter."""
+        return self.probabilities[:, BELIEVED]
+
+    @property
+    def alive(self) -> FloatArray:
+        """Probability that the object still exists, if it has ever existed."""
+        return self.probabilities[:, ALIVE]
+
+    @property
+    def own(self) -> FloatArray:
+        """Probability that the track is no second return of another track."""
+        return self.probabilities[:, OWN]
+
+    @property
+    def hazards_hz(self) -> FloatArray:
+        """Rates at which the probability of existence decays until the next list."""
+        return self.probabilities[:, HAZARD_HZ]
+
+    @property
+    def first_m(self) -> FloatArray:
+        """First positions, shape (n, 2)."""
+        return self.probabilities[:, FIRST_X_M : FIRST_Y_M + 1]
+
+    @property
+    def roots(self) -> IntArray:
+        """Numbers of the tracks: of the detections that started them."""
+        return self.numbers[:, ROOT]
+
+    @property
+    def hits(self) -> IntArray:
+        """Numbers of detections."""
+        return self.numbers[:, HITS]
+
+    @property
+    def sensors(self) -> IntArray:
+        """Numbers of the sensors that started the tracks."""
+        return self.numbers[:, SENSOR]
+
+    @property
+    def counts(self) -> IntArray:
+        """Numbers of detections by `sensors`."""
+        return self.numbers[:, COUNT]
+
+    @property
+    def misses(self) -> IntArray:
+        """Numbers of lists of `sensors` in whose view the object was, without a detection."""
+        return self.numbers[:, MISSES]
+
+    @property
+    def coasts(self) -> BoolArray:
+        """True for each track that was missed by the last list that could show it."""
+        return np.asarray(self.numbers[:, COASTS] == 1)
+
+    @property
+    def is_confirmed(self) -> BoolArray:
+        """True for each confirmed track."""
+        return self.numbers[:, IS_CONFIRMED] == 1
 
     @property
     def present(self) -> FloatArray:
@@ -56,25 +120,13 @@ class Nodes:
         return np.asarray(self.believed * self.alive * self.own)
 
     def at(self, rows: IntArray) -> "Nodes":
-        """Return the tracks in `rows`."""
+        """Return a copy of the tracks in `rows`."""
         return Nodes(
             self.means.take(rows, axis=0),
             self.covariances.take(rows, axis=0),
-            self.existed.take(rows),
-            self.believed.take(rows),
-            self.alive.take(rows),
             self.visible.take(rows, axis=0),
-            self.is_confirmed.take(rows),
-            self.has_travelled.take(rows),
-            self.first_m.take(rows, axis=0),
-            self.roots.take(rows),
-            self.hazards_hz.take(rows),
-            self.hits.take(rows),
-            self.counts.take(rows),
-            self.misses.take(rows),
-            self.sensors.take(rows),
-            self.own.take(rows),
-            self.coasts.take(rows),
+            self.probabilities.take(rows, axis=0),
+            self.numbers.take(rows, axis=0),
             tuple([self.descriptions[row] for row in rows.tolist()]),
         )
 
@@ -94,7 +146,7 @@ class Hypothesis:
 
     log_weight: float
     rows: IntArray
-    """Rows of its tracks that may still exist."""
+    """Rows of its tracks that may still exist, which ascend."""
     taken: tuple[int, ...]
     """Track of each candidate of the list, by root; `NONE` for clutter."""
     parent: int
@@ -121,21 +173,9 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
     nodes = Nodes(
         np.zeros((0, n)),
         np.zeros((0, n, n)),
-        np.zeros(0),
-        np.zeros(0),
-        np.zeros(0),
         np.zeros((0, num_sensors)),
-        np.zeros(0, dtype=bool),
-        np.zeros(0, dtype=bool),
-        np.zeros((0, 2)),
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0),
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0, dtype=np.int64),
-        np.zeros(0),
-        np.zeros(0, dtype=bool),
+        np.zeros((0, NUM_PROBABILITIES)),
+        np.zeros((0, NUM_NUMBERS), dtype=np.int64),
         (),
     )
     return Step(
@@ -145,16 +185,18 @@ def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:
 
 def joined(first: Nodes, second: Nodes) -> Nodes:
     """Return the tracks of both."""
-    if not len(second.roots):
+    if not len(second):
         return first
-    if not len(first.roots):
+    if not len(first):
         return second
-    arrays = {
-        name: np.concatenate([getattr(first, name), getattr(second, name)])
-        for name in Nodes.__annotations__
-        if name != "descriptions"
-    }
-    return Nodes(**arrays, descriptions=first.descriptions + second.descriptions)
+    return Nodes(
+        np.concatenate([first.means, second.means]),
+        np.concatenate([first.covariances, second.covariances]),
+        np.concatenate([first.visible, second.visible]),
+        np.concatenate([first.probabilities, second.probabilities]),
+        np.concatenate([first.numbers, second.numbers]),
+        first.descriptions + second.descriptions,
+    )
 
 
 def ended(nodes: Nodes, row: int) -> Ended:

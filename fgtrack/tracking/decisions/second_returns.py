@@ -43,12 +43,14 @@ def _log_beta(a: float, b: float) -> float:
     return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
-def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray:
-    """Return the density of second returns of the tracks in `rows` at each candidate, in 1/m^2, shape (m,)."""
+def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray | None:
+    """Return the density of second returns of the tracks in `rows` at each candidate, in 1/m^2, shape (m,).
+
+    None if there are no second returns.
+    """
     own = entry.sensor.second_returns
-    result = np.zeros(len(entry.candidates))
     if own is None or not len(rows) or not entry.placed.any():
-        return result
+        return None
     detected = (nodes.existed * nodes.alive * nodes.visible[:, entry.index])[
         rows
     ] * entry.sensor.detection_probability
