@@ -10,9 +10,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from fgtrack.core.geometry import body_point, polar, wrap_angles
+from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import DESCRIBING, MEASURABLE, BoolArray, Detection, FloatArray
+
+_KERNELS = "fgtrack.models.view_kernels"
+NUM_LIMITS = 7
+"""Number of columns of the limits of a sensor, see `fgtrack.models.view_kernels`."""
 
 
 @settings
@@ -313,28 +317,33 @@ class SensorModel:
         times and are in the map frame. `origin_m` is the origin of the detection frame
         in the ego frame.
         """
-        x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
-        zero_mps = np.zeros_like(x_m)
-        mount = self.mount_or_origin
-        at_x_m, at_y_m, _, _ = body_point(
-            x_m,
-            y_m,
-            yaw_rad,
-            zero_mps,
-            zero_mps,
-            origin_m[0] + mount.x_m,
-            origin_m[1] + mount.y_m,
+        shape = positions_m.shape[:-1]
+        views = np.empty((math.prod(shape), 1), dtype=bool)
+        kernels(_KERNELS).look(
+            positions_m.reshape(-1, 2),
+            np.ascontiguousarray(ego_poses).reshape(-1, 3),
+            self.view_limits(origin_m)[None],
+            np.zeros(1, dtype=np.int64),
+            views,
         )
-        direction_range = polar(positions_m - np.stack([at_x_m, at_y_m], axis=-1))
-        return in_view(
-            direction_range[..., 1],
-            direction_range[..., 0] - yaw_rad - mount.yaw_rad,
+        return views.reshape(shape)
+
+    def view_limits(self, origin_m: tuple[float, float]) -> FloatArray:
+        """Return place, field of view and ranges, shape (7,); see `fgtrack.models.view_kernels`.
+
+        `origin_m` is the origin of the detection frame in the ego frame.
+        """
+        mount = self.mount_or_origin
+        most_m = min(
+            (m for m in (self.max_range_m, self.view_range_m) if m is not None),
+            default=math.inf,
+        )
+        return _limits(
+            (origin_m[0] + mount.x_m, origin_m[1] + mount.y_m, mount.yaw_rad),
             self.field_of_view_rad or math.tau,
-            max_range_m=min(
-                (m for m in (self.max_range_m, self.view_range_m) if m is not None),
-                default=math.inf,
-            ),
-            max_range_behind_m=self.max_range_behind_m,
+            0.0,
+            most_m,
+            self.max_range_behind_m,
         )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
@@ -400,12 +409,21 @@ def in_view(
     `field_of_view_rad` is the full opening angle. `max_range_behind_m`, if smaller,
     replaces `max_range_m` in the half-plane behind the sensor.
     """
-    off_axis_rad = np.abs(wrap_angles(bearing_rad))
-    behind_m = (
-        max_range_m
-        if max_range_behind_m is None
-        else min(max_range_behind_m, max_range_m)
+    limits = _limits(
+        (0.0, 0.0, 0.0), field_of_view_rad, min_range_m, max_range_m, max_range_behind_m
     )
-    limit_m = np.where(off_axis_rad > math.pi / 2.0, behind_m, max_range_m)
-    in_range = (range_m >= min_range_m) & (range_m <= limit_m)
-    return np.asarray(in_range & (off_axis_rad <= field_of_view_rad / 2.0))
+    flat = (np.ascontiguousarray(each).reshape(-1) for each in (range_m, bearing_rad))
+    found = kernels(_KERNELS).in_view(*flat, limits)
+    return np.asarray(found.reshape(np.shape(range_m)))
+
+
+def _limits(
+    place: tuple[float, float, float],
+    field_of_view_rad: float,
+    least_m: float,
+    most_m: float,
+    most_behind_m: float | None,
+) -> FloatArray:
+    """Return the limits of a sensor at x, y, yaw in the ego frame, see `fgtrack.models.view_kernels`."""
+    behind_m = math.inf if most_behind_m is None else most_behind_m
+    return np.array([*place, 0.5 * field_of_view_rad, least_m, most_m, behind_m])

@@ -112,7 +112,7 @@ class Nodes:
     @property
     def is_confirmed(self) -> BoolArray:
         """True for each confirmed track."""
-        return self.numbers[:, IS_CONFIRMED] == 1
+        return np.asarray(self.numbers[:, IS_CONFIRMED] == 1)
 
     @property
     def present(self) -> FloatArray:

@@ -12,10 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from fgtrack.core.linalg import kernels
 from fgtrack.core.state import Snapshot, Stateful
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.models.sensors import SensorModel
+from fgtrack.models.sensors import NUM_LIMITS, SensorModel
 from fgtrack.tracking.ego.trajectory import EgoPose
 
 NEWEST = 1000
@@ -204,15 +205,18 @@ class Views:
         detection_origin_m: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
-        self._sensors, self._origin_m = list(sensors.values()), detection_origin_m
+        self._sensors = list(sensors.values())
         self._placing = np.array(
             [sensor.gives_position for sensor in self._sensors], dtype=bool
         )
-        self._limited = [
+        limited = [
             k
             for k, one in enumerate(self._sensors)
             if one.gives_position and one.has_view_limits
         ]
+        self._limited = np.array(limited, dtype=np.int64)
+        limits = [self._sensors[k].view_limits(detection_origin_m) for k in limited]
+        self._limits = np.array(limits).reshape(-1, NUM_LIMITS)
 
     def of(self, positions_m: FloatArray, ego: EgoPose | None) -> BoolArray:
         """Return, for objects at `positions_m` (m, 2), True for each sensor that could show the object, shape (m,
@@ -221,12 +225,11 @@ class Views:
         `ego` is the pose of the ego in the map. Without a pose, all objects are in view.
         """
         views = np.tile(self._placing, (len(positions_m), 1))
-        if ego is not None and self._limited:
-            poses = np.broadcast_to(
-                [ego.x_m, ego.y_m, ego.yaw_rad], (len(positions_m), 3)
+        if ego is not None and len(self._limited):
+            pose = np.array([[ego.x_m, ego.y_m, ego.yaw_rad]])
+            kernels("fgtrack.models.view_kernels").look(
+                positions_m, pose, self._limits, self._limited, views
             )
-            for k in self._limited:
-                views[:, k] = self._sensors[k].sees(positions_m, poses, self._origin_m)
         return views
 
     def at_birth(
