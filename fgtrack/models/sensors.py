@@ -329,7 +329,7 @@ class SensorModel:
         return views.reshape(shape)
 
     def view_limits(self, origin_m: tuple[float, float]) -> FloatArray:
-        """Return place, field of view and ranges, shape (7,); see `fgtrack.models.view_kernels`.
+        """Return pose, field of view and ranges, shape (7,), with the columns of `fgtrack.models.view_kernels`.
 
         `origin_m` is the origin of the detection frame in the ego frame.
         """

@@ -9,7 +9,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import NUM_LIMITS
 
 AHEAD_M, LEFT_M, YAW_RAD, HALF_FIELD_RAD, LEAST_M, MOST_M, MOST_BEHIND_M = range(7)
-"""Columns of the limits of sensors: place and axis of the sensor in the ego frame, half of the field of view, least and
+"""Columns of the limits of sensors: pose of the sensor in the ego frame, half of the field of view, least and
 largest range, and largest range in the half-plane behind the sensor."""
 
 

@@ -24,7 +24,9 @@ MODULES = (
     "fgtrack.estimation.smoothing.linearisation_kernels",
     "fgtrack.estimation.smoothing.relinearisation_kernels",
     "fgtrack.estimation.smoothing.solution_kernels",
-    "fgtrack.tracking.decisions.assignment_kernels",
+    "fgtrack.models.view_kernels",
+    "fgtrack.tracking.decisions.ranking_kernels",
+    "fgtrack.tracking.decisions.step_kernels",
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
     "fgtrack.tracking.lives.counter_kernels",
@@ -36,11 +38,15 @@ ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "compo
 #: Names of arguments by whose length a call is as long as it is, and further ones by function.
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {
-    "arrive.mean", "correct.y", "faults.means", "innovations.H", "innovations.y",
-    "judge.scans_ns", "near.points",
+    "arrive.mean", "correct.H", "correct.y", "distinct.pairs", "fade.probabilities", "faults.means", "innovations.H", "innovations.y",
+    "judge.probabilities", "judge.scans_ns", "near.points", "update.probabilities",
     "pose_error.points", "pose_error.components", "add_pose_error.R",
     "place.linearised1", "propagate.mean", "read.y", "turned.means",
 }  # fmt: skip
+HYPOTHESES: dict[str, Any] = {
+    "lifecycle": {"kind": "existence"},
+    "association": {"kind": "hypotheses"},
+}
 Calls = dict[str, list[Any]]
 
 
@@ -86,13 +92,13 @@ def calls() -> Calls:
             ):
                 if getattr(import_module(user), name, None) is own:
                     patch.setattr(import_module(user), name, called)
-    for estimator in (
-        "ekf-replay",
-        "smoother",
-        "smoother-banded",
-        "ekf-backward-forward",
+    for tracker in (
+        make("ekf-replay"),
+        make("smoother"),
+        make("smoother-banded"),
+        make("ekf-backward-forward"),
+        make("ekf-replay", **HYPOTHESES),
     ):
-        tracker = make(estimator)
         for k, messages in enumerate(lists(9)):
             for message in messages:
                 tracker.receive(message)

@@ -237,7 +237,7 @@ def _open(
 
 @inlined
 def _likeliest(keys: FloatArray, items: IntArray, count: int) -> int:
-    """Return the place of the largest key; of equal keys the earliest one, by the first column of `items`."""
+    """Return the index of the largest key. Of equal keys the earliest one counts: `items` begin with a number."""
     best = 0
     for k in range(1, count):
         if keys[k] > keys[best] or (
