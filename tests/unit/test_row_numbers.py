@@ -38,8 +38,8 @@ ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "compo
 #: Names of arguments by whose length a call is as long as it is, and further ones by function.
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {
-    "arrive.mean", "correct.H", "correct.y", "distinct.pairs", "fade.probabilities", "faults.means", "innovations.H", "innovations.y",
-    "judge.probabilities", "judge.scans_ns", "near.points", "update.probabilities",
+    "arrive.mean", "correct.H", "correct.y", "distinct.pairs", "fade.probabilities", "faults.means",
+    "innovations.H", "innovations.y", "judge.probabilities", "judge.scans_ns", "near.points", "update.probabilities",
     "pose_error.points", "pose_error.components", "add_pose_error.R",
     "place.linearised1", "propagate.mean", "read.y", "turned.means",
 }  # fmt: skip
