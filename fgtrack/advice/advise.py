@@ -101,9 +101,7 @@ def advise(
         str(recording), messages, result, reference, on_step, draft.decisions
     )
     advice = adviser.advice(broken, tune, ledger)
-    # A question stays open until it is answered, so its sensor is not ignored in the settings.
-    asked = draft.with_assumed(Assumed(advice.config)).assumed.config
-    return replace(advice, config=asked)
+    return replace(advice, config=draft.asking(advice.config))
 
 
 class Adviser:

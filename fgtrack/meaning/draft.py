@@ -126,6 +126,20 @@ class Draft:
         config = replace(assumed.config, ignore_sensors=tuple(ignored))
         return replace(self, assumed=replace(assumed, config=config))
 
+    def asking(self, config: Config) -> Config:
+        """Return `config` such that a later draft asks the open questions again.
+
+        No sensor with an open question is ignored, and a sensor with an assumed lever arm
+        has its mapping alone.
+        """
+        kept = self.with_assumed(Assumed(config)).assumed.config
+        sensors = {
+            name: item
+            for name, item in kept.sensors.items()
+            if name not in self.provisional_sensors
+        }
+        return replace(kept, sensors=sensors)
+
     def to_yaml(self, head: Iterable[str] = ()) -> str:
         """Return YAML text of all settings that differ from the defaults; each decision has its reason as a comment.
 
@@ -142,13 +156,7 @@ class Draft:
         asked = [f"Open: {line}" for line in self.questions]
         unused = [f"Not used: {line}" for line in self.unused]
         notes = [f"{part.label}: {note}" for part in self.parts for note in part.notes]
-        config = self.assumed.config
-        sensors = {
-            name: item
-            for name, item in config.sensors.items()
-            if name not in self.provisional_sensors
-        }
-        written = replace(self.assumed, config=replace(config, sensors=sensors))
+        written = replace(self.assumed, config=self.asking(self.assumed.config))
         return written.to_yaml([*head, *asked, *unused, *notes], comments)
 
 

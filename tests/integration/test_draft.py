@@ -312,6 +312,7 @@ def test_a_sensor_with_an_assumed_lever_arm_is_used_and_asked_again(
     again = Config.from_yaml(tmp_path / "s.yaml")
     assert list(again.sensors) == ["radar_front"]
     assert drafted(tables, again).problem == draft.problem
+    assert "lidar_rear" not in fgtrack.advise(tables).config.sensors
     words = ["replay", str(tables), "-o", str(tmp_path / "run"), "-e", "ekf-replay"]
     assert command(words) == 1
     assert "lidar_rear used with an assumed lever arm" in capsys.readouterr().err

@@ -112,6 +112,24 @@ def test_looped_playback_is_named_and_nothing_else() -> None:
     )
 
 
+def test_late_reports_with_stamps_in_whole_seconds_are_no_loop() -> None:
+    """Reports of ships: other reports have the same second, and some of them were received long before."""
+
+    def report(number: int, message: Message) -> Message:
+        stamp_ns = message.stamp_ns // (1000 * MS) * 1000 * MS
+        late_ns = 3000 * MS if number % 3 == 0 else 0
+        return replace(
+            message, stamp_ns=stamp_ns, receipt_ns=message.receipt_ns + late_ns
+        )
+
+    reports = [
+        report(number, message) if isinstance(message, DetectionList) else message
+        for number, message in enumerate(scene())
+    ]
+    reports.sort(key=lambda message: message.receipt_ns)
+    assert not [line for line in lines(reports) if "looped" in line]
+
+
 def test_stamps_ahead_of_their_receipts_are_named_as_a_clock() -> None:
     def ahead(message: Message) -> Message:
         is_radar = isinstance(message, DetectionList) and message.sensor == "radar"

@@ -23,6 +23,8 @@ _SILENCE_FACTOR = 3.0
 # A stamp is repeated if it was received at least this time before. A smaller share of repeated stamps may be copies.
 _LOOP_NS = NS_PER_S
 _LOOP_SHARE = 0.1
+# Largest share of repeated stamps in a loop that are followed by a new stamp. Late reports come between new ones.
+_NEW_SHARE = 0.1
 
 
 def received_nothing(run: Run) -> str | None:
@@ -119,7 +121,11 @@ def repeated(run: Run) -> Diagnostic | None:
 
 
 def _repeated_share(stamps_ns: IntArray, receipts_ns: IntArray) -> tuple[float, float]:
-    """Share of messages whose stamp was received before, and the median time in between [s]."""
+    """Share of messages whose stamp was received before, and the median time in between [s].
+
+    The share is 0 if new stamps are received between the repeated ones, as with late
+    reports whose stamps are whole seconds.
+    """
     messages = np.unique(np.stack([stamps_ns, receipts_ns], axis=-1), axis=0)
     if not len(messages):
         return 0.0, 0.0
@@ -128,8 +134,12 @@ def _repeated_share(stamps_ns: IntArray, receipts_ns: IntArray) -> tuple[float, 
         messages[:, 1] - messages[first[np.searchsorted(stamps, messages[:, 0])], 1]
     )
     again = (since_ns > _LOOP_NS) & (messages[:, 0] != 0)
-    period_s = float(np.median(since_ns[again])) / NS_PER_S if again.any() else 0.0
-    return float(again.mean()), period_s
+    order = np.lexsort((messages[:, 0], messages[:, 1]))
+    newest_ns = np.maximum.accumulate(messages[order, 0])
+    is_new = np.diff(newest_ns, append=newest_ns[-1]) > 0
+    if not again.any() or is_new[again[order]].mean() > _NEW_SHARE:
+        return 0.0, 0.0
+    return float(again.mean()), float(np.median(since_ns[again])) / NS_PER_S
 
 
 def angles(run: Run) -> Iterator[Diagnostic]:
