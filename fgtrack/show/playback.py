@@ -101,10 +101,14 @@ class _Recording:
         """Return the rows of `states` with a finite position and time, sorted by the column `time`, then by the columns
         `order`.
         """
-        states = with_position(states)
-        states = states.where(np.isfinite(self.seconds(states[time])))
+        states = self.placed(states, time)
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
         return states.where(keys)
+
+    def placed(self, states: Columns, time: str) -> Columns:
+        """Return the rows of `states` with a finite position and time."""
+        states = with_position(states)
+        return states.where(np.isfinite(self.seconds(states[time])))
 
     def columns(self, states: Columns, time: str) -> Json:
         """Return the columns of the viewer for rows of `states`: times, positions, and yaws if there are any.
@@ -140,13 +144,11 @@ class _Recording:
         ego = run.tables["ego"]
         truth = run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
         (ego,) = _thinned([self.rows(ego, "stamp_ns")], "stamp_ns", most, "ego", notes)
+        # A long table is thinned before it is sorted.
         (truth,) = _thinned(
-            [self.rows(truth, "stamp_ns", "object_id")],
-            "stamp_ns",
-            most,
-            "truth",
-            notes,
+            [self.placed(truth, "stamp_ns")], "stamp_ns", most, "truth", notes
         )
+        truth = self.rows(truth, "stamp_ns", "object_id")
         return {
             # A text, because a number of JavaScript has too few digits.
             "start_ns": str(self.start_ns),
@@ -171,8 +173,9 @@ class _Recording:
         )
         final = self.rows(smoothed.where(smoothed["kind"] == "final"), "stamp_ns")
         ticks = Columns({"now_ns": np.unique(tables["timing"]["now_ns"])})
-        of_ticks = [ticks, self.rows(tables["tracks"], "now_ns", "track_id"), past]
+        of_ticks = [ticks, self.placed(tables["tracks"], "now_ns"), past]
         ticks, tracks, past = _thinned(of_ticks, "now_ns", most, one.label, notes)
+        tracks = self.rows(tracks, "now_ns", "track_id")
         (final,) = _thinned(
             [final], "stamp_ns", most, f"{one.label}, final states", notes
         )

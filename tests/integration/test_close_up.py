@@ -12,7 +12,7 @@ import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.evaluation.placement import detections_in_map
 from fgtrack.show.figures.close_up import Arrival, CloseUp
-from fgtrack.show.figures.late_detection import close_up_of
+from fgtrack.show.figures.late_detection import chosen, close_up_of
 from fgtrack.show.palette import style_of
 
 NAMES = ("ekf-replay", "ekf-backward-forward")
@@ -45,6 +45,23 @@ def test_it_is_one_detection_that_came_late_and_the_rule_says_how_typical_it_is(
     errors_m = re.match(rule, found[0].rule)
     assert errors_m is not None
     assert float(errors_m[1]) > float(errors_m[2])
+
+
+def test_a_close_up_of_a_long_run_is_chosen_among_its_first_late_detections(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fgtrack.load_run(folder / "runs" / NAMES[0])
+    every, _ = chosen([run])
+    monkeypatch.setattr("fgtrack.show.figures.late_detection._MOST_LATE", 40)
+    arrival, rule = chosen([run])
+    late_ticks = np.sort(run.updates.query("disposition == 'out_of_sequence'")["tick"])
+    tick = run.updates.query(
+        f"stamp_ns == {arrival.stamp_ns} and receipt_ns == {arrival.receipt_ns}"
+    )["tick"]
+    assert "of the first" in rule
+    assert tick.max() <= late_ticks[50]
+    last, _ = chosen([run], every.stamp_ns)
+    assert last.stamp_ns == every.stamp_ns
 
 
 def test_it_draws_the_past_towards_the_detection_and_is_fused_once(

@@ -16,9 +16,9 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.models.track_map import COLUMNS
-from fgtrack.runs import Run
+from fgtrack.runs import Columns, Run
 from fgtrack.show.figures import plot
-from fgtrack.show.figures.style import WRONG, broken_line
+from fgtrack.show.figures.style import WRONG, broken_line, log_axis
 
 TICKS = range(60)
 
@@ -289,6 +289,46 @@ def test_a_map_of_tracks_with_rare_updates_has_no_empty_close_up(
     assert len(plot.map(run).axes) == 2
     rare = updates.where(np.arange(updates.num_rows) < 2)
     assert len(plot.map(run.with_tables(updates=rare)).axes) == 1
+
+
+def test_a_map_of_more_than_twenty_kilometres_has_axes_in_kilometres(
+    tmp_path: Path,
+) -> None:
+    run = a_run(tmp_path / "run")
+    ego = run.tables["tracks"].where(np.arange(2))
+    far = {
+        **{name: ego[name] for name in run.tables["ego"] if name in ego},
+        "receipt_ns": ego["stamp_ns"],
+        "x_m": np.array([0.0, 40e3]),
+        "y_m": np.zeros(2),
+    }
+    axes = plot.map(run.with_tables(ego=Columns(far))).axes[0]
+    assert axes.get_xlabel() == "x, east [km]"
+    axes.figure.canvas.draw()
+    shown = [text.get_text() for text in axes.get_xticklabels()]
+    assert "40" in shown or "20" in shown
+
+
+@pytest.mark.parametrize("ends", [(1.5, 30.0), (1e-9, 10.0), (1e-4, 1e4)])
+def test_a_logarithmic_axis_of_any_length_has_ticks(ends: tuple[float, float]) -> None:
+    axes = Figure().subplots()
+    axes.set(yscale="log", ylim=ends)
+    log_axis(axes.yaxis)
+    ticks = [tick for tick in axes.get_yticks() if ends[0] <= tick <= ends[1]]
+    assert len(ticks) >= 2
+
+
+def test_the_axis_of_a_nis_reaches_above_its_expected_value(tmp_path: Path) -> None:
+    """Repeated reports have innovations of nearly 0, which must not make the axis as long as they are small."""
+    updates = {
+        k: [update("lidar", tick=k, x_m=1e-9, y_m=0.0, nis=1e-12)] for k in TICKS
+    }
+    run = write_run(
+        tmp_path / "run", [[WEST.track(k, 1)] for k in TICKS], updates=updates
+    )
+    low, high = plot.consistency(run).axes[0].get_ylim()
+    assert high >= 4.0
+    assert low >= 1e-3
 
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:

@@ -15,7 +15,7 @@ from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.runs import Runs, evaluated
-from fgtrack.evaluation.truth import TruePath, true_paths
+from fgtrack.evaluation.truth import TruePath, paths_around
 from fgtrack.show.figures.paper import Paper, Sheet, is_column, styled
 from fgtrack.show.figures.style import GREY, legend_above, run_styles
 from fgtrack.show.palette import CurveStyle
@@ -96,7 +96,7 @@ def close_up(
     at_m = first.after.means[-1, :2]
     paths = [
         path
-        for path in true_paths(every[0].run.tables["truth"])
+        for path in paths_around(every[0].run, now_ns)
         if np.isfinite(path.at(now_ns)[0, 0])
     ]
     truth = min(

@@ -28,8 +28,11 @@ from fgtrack.show.palette import SENSORS
 _WINDOWS = 40
 _SHORTEST = 5
 _LONGEST = 100
-# Lower end of the axis, as a share of the expected value.
+# Lower end of the axis, as a share of the expected value: of the mean, and of single values, some of which are near 0.
 _LOWEST = 0.02
+_LOWEST_SINGLE = 1e-3
+# The axis reaches at least this multiple of the expected value.
+_HIGHEST = 4.0
 
 
 @styled
@@ -119,8 +122,12 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             1.25 * float(shown.max()),
         ]
         if name != _NEES and len(positive):
-            ends = np.quantile(positive, (0.05, 0.99))
-            limits = [min(limits[0], ends[0]), max(limits[1], ends[1])]
+            usual = float(np.median(expected))
+            first, last = np.quantile(positive, (0.05, 0.99)).tolist()
+            limits = [
+                min(limits[0], max(first, _LOWEST_SINGLE * usual)),
+                max(limits[1], last, _HIGHEST * usual),
+            ]
         axes.set(
             yscale="log",
             ylim=limits,

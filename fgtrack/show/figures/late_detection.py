@@ -11,9 +11,16 @@ from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import FUSED, DetectionList, Disposition
+from fgtrack.core.types import (
+    FUSED,
+    DetectionList,
+    Disposition,
+    FloatArray,
+    IntArray,
+)
+from fgtrack.evaluation.matching import published_rows
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
-from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.truth import paths_around
 from fgtrack.meaning.draft import opened
 from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
@@ -35,6 +42,8 @@ _SETTLED = 20
 # Length of the first part of the recording in which the detection is chosen, if possible. Every run replays
 # the recording up to the detection.
 _EARLY_S = 20.0
+# Largest number of late detections among which one is chosen: a close-up of an hour needs the hour's first minutes.
+_MOST_LATE = 10_000
 
 
 def close_ups(
@@ -191,7 +200,7 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
     Ticks in which a track fused several detections are excluded, and tracks with fewer than twenty measurements. Raises
     `DataError` if there is no such detection.
     """
-    first, *others = (_late_detections(run) for run in runs)
+    first, *others = (_late_detections(run, stamp_ns) for run in runs)
     late = first[
         np.all([first.index.isin(other.index) for other in (first, *others)], axis=0)
     ]
@@ -217,7 +226,7 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
         row = int((late["moved_m"] - late["moved_m"].median()).abs().argmin())
         return (
             arrivals[row],
-            f"Of {len(late)} late detections, the one that moves the present by the median.",
+            f"Of {late.attrs['name']}, the one that moves the present by the median.",
         )
     rms_m, (rms_before_m, rms_after_m, *_) = (
         np.sqrt(np.nanmean(rows_m**2, axis=0))
@@ -230,51 +239,75 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
     early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
     row = int(np.where(early if early.any() else candidates, ratio, np.inf).argmin())
     return arrivals[row], (
-        f"{100.0 * float(lowered.mean()):.0f} % of {len(late)} late detections lower the present error; this "
+        f"{100.0 * float(lowered.mean()):.0f} % of {late.attrs['name']} lower the present error; this "
         f"detection, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to "
         f"{rms_m[1]:.2f} m; over all late detections {rms_before_m:.2f} to {rms_after_m:.2f} m)."
     )
 
 
-def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
+def _late_detections(
+    run: Run, stamp_ns: int | None
+) -> Any:  # Any: a DataFrame, whose columns have no types
     """Return a table of the late detections that a track fused alone in a tick, indexed by `_DETECTION`.
 
     The track has fused at least `_SETTLED` detections. Columns in metres: `moved_m`, the distance of the present from
     its prediction, and `before_m` and `after_m`, the errors before and after the fusion. They are NaN without truth.
+    Only the first `_MOST_LATE` late detections count, or with `stamp_ns` those with the nearest stamps. `attrs["name"]`
+    names them in a sentence.
     """
-    both = ["tick", "track_id"]
-    fused = run.updates[run.updates["disposition"].isin(FUSED[1:])]
-    late = fused[
-        (fused["disposition"] == Disposition.OUT_OF_SEQUENCE)
-        & ~fused.duplicated(both, keep=False)
-    ]
-    tracks = run.tracks[[*both, "now_ns", "num_measured", *_STATE]]
-    late = late[[*both, *_DETECTION]].merge(
-        tracks[tracks["num_measured"] >= _SETTLED], on=both
+    import pandas as pd
+
+    tracks, updates = run.tables["tracks"], run.tables["updates"]
+    fused = updates.where(np.isin(updates["disposition"], FUSED[1:]))
+    together = np.stack([fused["tick"], fused["track_id"]], axis=-1)
+    _, inverse, counts = np.unique(
+        together, axis=0, return_inverse=True, return_counts=True
     )
-    late = late.merge(
-        tracks.assign(tick=tracks["tick"] + 1), on=both, suffixes=("", "_before")
+    late = fused.where(
+        (fused["disposition"] == Disposition.OUT_OF_SEQUENCE) & (counts[inverse] == 1)
     )
-    late = late.drop_duplicates(_DETECTION)
-    now_ns = late["now_ns"].to_numpy()
-    at_m = late[["x_m", "y_m"]].to_numpy()
-    dt_s = (now_ns - late["now_ns_before"].to_numpy()) / NS_PER_S
+    is_cut = late.num_rows > _MOST_LATE
+    if is_cut and stamp_ns is not None:
+        away_ns = np.abs(late["stamp_ns"] - stamp_ns)
+        late = late.where(np.sort(np.argsort(away_ns, kind="stable")[:_MOST_LATE]))
+    elif is_cut:
+        late = late.where(np.arange(_MOST_LATE))
+    rows, rows_before = (
+        published_rows(tracks, late["tick"] - back, late["track_id"]) for back in (0, 1)
+    )
+    known = (rows >= 0) & (rows_before >= 0)
+    known[known] = tracks["num_measured"][rows[known]] >= _SETTLED
+    late = late.where(known)
+    now, before = tracks.where(rows[known]), tracks.where(rows_before[known])
+    now_ns = now["now_ns"]
+    at_m = np.stack([now["x_m"], now["y_m"]], axis=-1)
     predicted_m = CTRV().predict(
-        late[[f"{name}_before" for name in _STATE]].to_numpy(), dt_s
+        np.stack([before[name] for name in _STATE], axis=-1),
+        (now_ns - before["now_ns"]) / NS_PER_S,
     )[:, :2]
-    paths = true_paths(run.tables["truth"])
-    true_m = np.stack(
-        [path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)]
-    )
-    distance_m = np.linalg.norm(true_m - at_m, axis=-1)
-    nearest_m = true_m[
-        np.where(np.isnan(distance_m), np.inf, distance_m).argmin(axis=0),
-        np.arange(len(late)),
-    ]
+    nearest_m = _nearest_truth(run, now_ns, at_m)
+    table = pd.DataFrame({name: late[name] for name in _DETECTION})
     for name, item, other in (
         ("moved_m", at_m, predicted_m),
         ("before_m", predicted_m, nearest_m),
         ("after_m", at_m, nearest_m),
     ):
-        late[name] = np.linalg.norm(item - other, axis=-1)
-    return late.set_index(_DETECTION)
+        table[name] = np.linalg.norm(item - other, axis=-1)
+    table = table.drop_duplicates(_DETECTION).set_index(_DETECTION)
+    table.attrs["name"] = (
+        f"{'the first ' if is_cut else ''}{len(table)} late detections"
+    )
+    return table
+
+
+def _nearest_truth(run: Run, now_ns: IntArray, at_m: FloatArray) -> FloatArray:
+    """Return the position of the true object that is nearest to each position `at_m` (n, 2) at `now_ns` (n,)."""
+    nearest_m = np.full_like(at_m, np.nan)
+    least_m = np.full(len(at_m), np.inf)
+    for path in paths_around(run, now_ns):
+        true_m = path.at(now_ns)[:, :2]
+        distance_m = np.linalg.norm(true_m - at_m, axis=-1)
+        nearer = distance_m < least_m
+        nearest_m[nearer] = true_m[nearer]
+        least_m[nearer] = distance_m[nearer]
+    return nearest_m

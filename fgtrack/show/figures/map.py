@@ -11,7 +11,6 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import detections_in_map, road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
-from fgtrack.evaluation.truth import true_paths
 from fgtrack.runs import Columns, Run
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import (
@@ -20,6 +19,7 @@ from fgtrack.show.figures.style import (
     broken_line,
     bulk,
     legend_above,
+    map_axes,
     usual_step_ns,
 )
 from fgtrack.show.palette import PALETTE
@@ -54,10 +54,11 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     )
     detections_m = detections_in_map(one.run).position_m
     ego_m = _positions(one.run.tables["ego"])
+    paths = () if one.matching is None else one.matching.paths
     required = [
         *bounds_m,
         ego_m,
-        *(path.states[:, :2] for path in true_paths(one.run.tables["truth"])),
+        *(path.states[:, :2] for path in paths),
     ]
     samples_m = [_positions(tracks), detections_m]
     edges = [
@@ -92,13 +93,12 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
                 zorder=above,
             )
         _draw_objects(axes, one, tracks, near)
-        axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
-        axes.set_aspect("equal", adjustable="datalim")
         corners = (
             (lows_m, highs_m)
             if near is None
             else (near.middle_m - near.half_m, near.middle_m + near.half_m)
         )
+        map_axes(axes, float((corners[1] - corners[0]).max()))
         x_m, y_m = np.transpose(corners)
         axes.set_xlim(*x_m, auto=True)  # an equal aspect may widen one of the two
         axes.set_ylim(*y_m, auto=True)
@@ -194,7 +194,7 @@ def _draw_objects(
         else one.matching.object_index
     )
     near = _near(tracks["stamp_ns"], window)
-    paths = [] if one.matching is None else true_paths(one.run.tables["truth"])
+    paths = () if one.matching is None else one.matching.paths
     few = len(paths) <= _NAMED_OBJECTS
     for index in (*range(max(len(paths), owners.max(initial=-1) + 1)), -1):
         color, label = (

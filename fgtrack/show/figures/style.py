@@ -48,6 +48,10 @@ _BESIDE_IN = 0.6
 _FREE_LINES = 2
 # Values within this number of interquartile ranges from the quartiles belong to the bulk.
 _BEYOND = 3.0
+# Ratio of the ends of a logarithmic axis above which it has one tick in a decade.
+_LONG_AXIS = 1e3
+# Width of a map above which its axes are in kilometres.
+_WIDE_M = 20e3
 _MARGIN = 0.05
 # Comments of an EPS file that differ from run to run.
 _DATES = (b"%%CreationDate", b"%%Title", b"%%Creator")
@@ -235,10 +239,27 @@ def grow(figure: Figure, name: str, lines: int) -> None:
 
 
 def log_axis(axis: Axis) -> None:
-    """Set plain numbers as ticks at 1, 2 and 5 of every decade of a logarithmic `axis`."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """Set plain numbers as ticks at 1, 2 and 5 of every decade of a logarithmic `axis`.
+
+    An axis of more than three decades has ticks at 1 alone: the locator has no ticks at
+    all where three in a decade are too many.
+    """
+    low, high = np.sort(axis.get_view_interval()).tolist()
+    is_long = not 0.0 < high < low * _LONG_AXIS
+    axis.set_major_locator(LogLocator(subs=(1.0,) if is_long else (1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
+
+
+def map_axes(axes: Axes, widest_m: float) -> None:
+    """Label `axes` as a map, in metres; in kilometres if the map is wider than 20 km."""
+    unit = "m"
+    if widest_m > _WIDE_M:
+        unit = "km"
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(lambda value_m, _: f"{value_m / 1e3:g}")
+    axes.set(xlabel=f"x, east [{unit}]", ylabel=f"y, north [{unit}]")
+    axes.set_aspect("equal", adjustable="datalim")
 
 
 def usual_step_ns(stamps_ns: IntArray) -> float:
