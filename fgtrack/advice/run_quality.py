@@ -146,7 +146,7 @@ class RunQuality:
 
     @classmethod
     def of(cls, run: Run) -> "RunQuality":
-        """Compute the quality of `run`."""
+        """Return the quality of `run`: used detections, births, consistency of the noise, and metrics of the truth."""
         counts = dict(run.meta["counts"])
         used = {
             name: sum(item.get(fate, 0) for fate in USED) / (sum(item.values()) or 1)

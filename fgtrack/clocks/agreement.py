@@ -103,7 +103,7 @@ class Agreement:
 def agreements(
     messages: Sequence[Message], config: Config, run: Run
 ) -> list[Agreement]:
-    """Return the agreement of each sensor with the reference: the sensor with most detections in the tracks of `run`.
+    """Return the agreement of each sensor with the reference, the sensor with the most detections in tracks.
 
     `run` is a run of `messages`. Only sensors with positions, or with range and bearing, are compared. A sensor without
     a detection near an object of the reference has 0 pairs. The result is empty if the ego has too few states.

@@ -230,8 +230,9 @@ def estimate_offsets(
     """Return the clock offsets of the sensors, estimated from the tracks of the tracker of `config`.
 
     With truth, and without a given `reference`, an offset is the error of the clock. Otherwise it is the difference
-    from the clock of the reference sensor. The default reference is the sensor with most detections, without the
-    `doubtful` sensors. If delays prove that its stamps are late, another sensor becomes the reference.
+    from the clock of the reference sensor. The default reference is the sensor with the most detections, the
+    `doubtful` sensors excluded. If its delays prove that the stamps of the reference are late, another sensor becomes
+    the reference.
 
     No message is refused for its delay, because a wrong stamp looks like a delay. `run` is a run of `messages` in which
     none was refused. Without it the messages are replayed.

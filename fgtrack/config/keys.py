@@ -251,8 +251,8 @@ def settings_page(target: str, heading: str = "##") -> str:
 def commented(value: object) -> str:
     """Return the YAML text of a settings dataclass: every key with its meaning and default as a comment.
 
-    A comment stands at the first occurrence of a key. Comments at the end list the keys
-    of the kinds that `value` does not contain.
+    A key has its comment only where it occurs first. Comments at the end list the keys of
+    the kinds that `value` does not use, for example of the other motion models.
     """
     seen: set[type] = set()
     lines = _commented_lines(value, seen)

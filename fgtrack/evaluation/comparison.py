@@ -134,7 +134,7 @@ def ranked(
 
 
 def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
-    """Return the numbers of an entry for `entry_columns`; `name` is the key of its value."""
+    """Return the record of a table row that `entry_columns` formats; `name` is the key of the entry's value."""
     worse = entry.worse_by or UNKNOWN
     values = {"run": entry.name, name: entry.value, "standing": entry.standing}
     return values | {"worse_by": worse.mean, "low": worse.low, "high": worse.high}

@@ -94,9 +94,10 @@ def tune_sources(
     rules: TuneRules | None = None,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> TuneReport:
-    """Fit noise to messages in receipt order, by name of their recording; see `tune`.
+    """Fit noise to recordings that are open already; see `tune`.
 
-    `on_step` is called with the name of each step.
+    `sources` maps the name of each recording to its source, which yields messages in receipt order. `on_step` is called
+    with the name of each step.
     """
     messages: dict[str, list[Message]] = {}
     broken: dict[str, str] = {}

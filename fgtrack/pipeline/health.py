@@ -312,7 +312,11 @@ def overall(
     ticks: Sequence[str],
     revised: Revised,
 ) -> Health:
-    """Return the health of the tracker. `stale` has reasons to call it stale; `ticks` has reasons of its ticks."""
+    """Return the health of the tracker.
+
+    `stale` contains the reasons why the tracks are stale; `ticks` contains the faults of the ticks. With any reason in
+    `stale` the state is `STALE`, with any other reason `DEGRADED`.
+    """
     own = [
         f"{name}: {reason}" for name, one in sensors.items() for reason in one.reasons
     ]

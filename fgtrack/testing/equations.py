@@ -299,8 +299,9 @@ def direction(ahead: Any, left: Any) -> Any:
 def measured(
     components: Sequence[str], state_names: Sequence[str], x: Any, pose: Any
 ) -> list[Any]:
-    """Values of `components` without noise, of one state x (n,) and a sensor pose (x, y, yaw, vx, vy), both maybe
-    complex. Angles are not wrapped.
+    """Return the values of `components` for a state x (n,), without noise; angles are not wrapped.
+
+    `pose` is the pose of the sensor: x, y, yaw, vx, vy. State and pose may be complex, for complex-step derivatives.
     """
     own = dict(zip(state_names, x, strict=True))
     if "vx_mps" in own:

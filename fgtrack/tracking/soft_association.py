@@ -49,10 +49,11 @@ def joint_probabilities(
 
 
 def marginals(weights: FloatArray) -> FloatArray:
-    """Return the probabilities, shape (m, n), that m tracks and n detections belong together.
+    """Return the probabilities that each of m tracks and each of n detections belong together, shape (m, n).
 
-    They are sums over all joint events, by belief propagation (Williams, Lau, IEEE T-AES 50, 2014). They are exact if
-    no tracks compete for two detections in a circle. `weights` (m, n) are relative to a missed detection and clutter.
+    Belief propagation sums over all joint events (Williams, Lau, IEEE T-AES 50, 2014). The sums are exact if the graph
+    of tracks and detections with positive weights has no cycle. `weights` (m, n) are likelihood ratios of a detection
+    of the track over a missed detection and clutter.
     """
     ratios = np.ones_like(weights)
     for _ in range(_ITERATIONS):

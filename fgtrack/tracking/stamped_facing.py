@@ -1,4 +1,4 @@
-"""Fronts of tracks whose yaws may be read once more: beliefs and shares in the order of stamps."""
+"""Fronts of tracks from yaws that are read again after late lists: the result follows the order of stamps."""
 
 from bisect import bisect_left
 from collections.abc import Iterable
@@ -14,10 +14,11 @@ _stamp = itemgetter(0)
 
 
 class StampedFacing(Facing):
-    """Belief about the front of each track, which does not depend on the order of arrival.
+    """Belief about the front of each track. It does not depend on the order of arrival.
 
-    A reading depends on the older detections of its track, and on the shares of wrong yaws of its sensor. The shares at
-    a stamp are those of the lists that are older by more than the horizon: no late list can change these lists.
+    The reading of a yaw depends on the older detections of the track, and on the shares of flipped and other wrong yaws
+    of the sensor. At each stamp, these shares are learned only from lists that are older than the stamp by more than
+    the horizon. Late lists cannot change these older lists.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -28,17 +29,18 @@ class StampedFacing(Facing):
     )
 
     def __init__(self, cartesian: bool, horizon_ns: int) -> None:
-        """`horizon_ns`: time after which a list is decided for good."""
+        """`horizon_ns` is the time after which no late list changes the decisions about a list."""
         super().__init__(cartesian)
         self._horizon_ns = horizon_ns
-        # Flipped and other shares of the yaws of each list, by sensor and stamp, and by the index of the candidate.
+        # Probabilities that a yaw is flipped, or wrong otherwise, by sensor and stamp, and by index of the candidate.
         self._noted: dict[tuple[str, int], dict[int, tuple[float, float]]] = {}
-        # Stamps of the lists that are decided for good, and the numbers of yaws after them, by sensor.
+        # For each sensor, stamps of the lists that are decided for good, and numbers of right, flipped and other yaws
+        # up to each list.
         self._settled: dict[str, list[tuple[int, FloatArray]]] = {}
         self._stamp_ns = 0
 
     def turn_to(self, stamp_ns: int) -> None:
-        """Use the shares of wrong yaws at a stamp."""
+        """Use the shares of wrong yaws at `stamp_ns` for the next readings."""
         self._stamp_ns = stamp_ns
 
     def belief(self, track_id: int) -> tuple[float, int]:
@@ -47,13 +49,16 @@ class StampedFacing(Facing):
         return float(self._log_odds[row]), int(self._stamps_ns[row])
 
     def believe(self, track_id: int, belief: tuple[float, int]) -> None:
-        """Go back to an earlier `belief`."""
+        """Restore an earlier `belief` about the front of a track."""
         row = self._rows[track_id]
         self._log_odds[row], self._stamps_ns[row] = belief
         self._least_log_odds = None
 
     def settle(self, sensor: str, stamp_ns: int, chosen: Iterable[int]) -> None:
-        """Learn the shares from a list that is decided for good: from the `chosen` candidates, which have tracks."""
+        """Learn the shares of wrong yaws of `sensor` from a list that no late list can change any more.
+
+        `chosen` are the indices of the candidates that belong to tracks; the others are not counted.
+        """
         noted = self._noted.pop((sensor, stamp_ns), None)
         if noted is None:
             return
@@ -85,7 +90,7 @@ class StampedFacing(Facing):
         has_yaw: bool,
         candidates: IntArray,
     ) -> list[tuple[int, YawWord]]:
-        """See `Facing._learn`. A yaw that is read once more is counted once."""
+        """See `Facing._learn`. A yaw that is read several times is counted once."""
         before = {name: own.copy() for name, own in self.counts.items()}
         words = super()._learn(
             sensor, stamp_ns, rows, codes, evidence, has_yaw, candidates

@@ -116,10 +116,11 @@ class TrackInitiation:
         return mean, covariance
 
     def turned(self) -> Start:
-        """Return the start with the direction and the speed of the line, and with its own uncertainty.
+        """Return the start with the direction and the speed of the line, and with the standard deviations of the start.
 
-        The measurements are fused from this start. The speed counts a little more than once if the line and the
-        start are about equally certain of the speed. Raises the exceptions of `state`.
+        The estimator fuses the measurements again from the returned start. The speed of the line comes from these
+        measurements, too: if the start was about as certain of the speed as the line, this
+        speed counts a little more than once. Raises the exceptions of `state`.
         """
         yaw_rad, speed_mps = self._course()
         std_rad = (

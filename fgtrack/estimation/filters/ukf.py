@@ -200,8 +200,10 @@ def _root(covariance: FloatArray) -> FloatArray:
 def measurement_regression(
     measurement: Measurement, mean: FloatArray, covariance: FloatArray
 ) -> Regression:
-    """Return the regression of the measurement model. Angles that are not entries of the state are averaged on the
-    circle.
+    """Return the statistical linear regression of the measurement model about a state.
+
+    `mean` (n,) and `covariance` (n, n) describe the state. Measured angles that the state does not contain are
+    averaged on the circle.
     """
     model, pose = measurement.model, measurement.pose
     rule = _rule_of(measurement, mean, covariance)

@@ -93,7 +93,7 @@ def conclude(
 ) -> bool:
     """Overwrite mean and P by x + K y and A P A' + K R K' with A = I - K H. True if all values are finite.
 
-    `K` is the transposed gain, shape (k, n).
+    `K` is the transposed gain, shape (k, n). `AP` (n, n) and `KR` (k, n) are scratch.
     """
     total, n = 0.0, len(mean)
     product(A, P, AP)

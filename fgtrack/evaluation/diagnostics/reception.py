@@ -105,7 +105,7 @@ def _silence(one: Mapping[str, Any], first_ns: int, last_ns: int) -> str | None:
 
 
 def repeated(run: Run) -> Diagnostic | None:
-    """Diagnostic that the recording repeats itself: stamps return that were received before; None if they do not."""
+    """Return a diagnostic if stamps that were received before are received again, as in looped playback; else None."""
     shares = {}
     for name, table in [(EGO, run.tables["ego"]), *by_sensor(run.tables["detections"])]:
         share, period_s = _repeated_share(table["stamp_ns"], table["receipt_ns"])

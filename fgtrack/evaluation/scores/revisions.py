@@ -63,25 +63,25 @@ class RevisionMetrics:
 
 @dataclass(frozen=True)
 class TracksOfDetections:
-    """Tracks that detections had, from one time to another. A detection has a row for each track that it had."""
+    """Tracks of detections over time: one row for each detection and each track that it had."""
 
     update: IntArray
-    """Row of updates.csv of the detection, shape (n,)."""
+    """Row of the detection in updates.csv, shape (n,)."""
     track_ids: IntArray
-    """Track, shape (n,); `NO_TRACK` for a detection without a track."""
+    """Number of the track, shape (n,); `NO_TRACK` for a detection without a track."""
     from_ns: IntArray
-    """Time of the tick from which on the detection has this track, shape (n,)."""
+    """Time of the tick at which the detection got this track, shape (n,)."""
     until_ns: IntArray
-    """Time of the tick at which it changes, shape (n,); the largest integer for the last track."""
+    """Time of the tick at which the detection lost this track, shape (n,); the largest integer for the last track."""
 
     @property
     def is_last(self) -> BoolArray:
-        """Mask of the tracks that detections have in the end, shape (n,)."""
+        """Mask of the rows with the last track of a detection, shape (n,)."""
         return np.asarray(self.until_ns == FOREVER_NS)
 
     @property
     def is_first(self) -> BoolArray:
-        """Mask of the tracks that detections have at arrival, shape (n,)."""
+        """Mask of the rows with the track of a detection at its arrival, shape (n,)."""
         first = np.ones(len(self.update), dtype=np.bool_)
         first[1:] = self.update[1:] != self.update[:-1]
         return first
@@ -91,7 +91,7 @@ FOREVER_NS = int(np.iinfo(np.int64).max)
 
 
 def revision_metrics(run: Run, options: EvaluationConfig) -> RevisionMetrics:
-    """Return what `run` has taken back. It needs no truth."""
+    """Return the decisions and states of `run` that late data has changed. No truth is needed."""
     own = tracks_of_detections(run)
     last = own.is_last
     at_arrival, in_the_end = own.track_ids[own.is_first], own.track_ids[last]
@@ -114,9 +114,10 @@ def revision_metrics(run: Run, options: EvaluationConfig) -> RevisionMetrics:
 
 
 def tracks_of_detections(run: Run) -> TracksOfDetections:
-    """Return the tracks of all detections of updates.csv over time, by ascending update and time.
+    """Return the tracks of all detections over time, in the order of updates.csv and then of time.
 
-    A repeated list (`duplicate`) has no track. A change in a tick without a time counts at the next tick.
+    Detections of a repeated list (`duplicate`) have no track. A change in a tick that is missing in timing.csv counts
+    at the next tick.
     """
     updates, revisions = run.tables["updates"], run.tables["revisions"]
     number, of_revision = _same(updates, revisions)
@@ -133,7 +134,7 @@ def tracks_of_detections(run: Run) -> TracksOfDetections:
 
 
 def later_states(run: Run) -> Columns:
-    """Return the states that are known last: final ones, otherwise those with the longest lag. May be empty."""
+    """Return the final states, or the states with the longest lag if there are no final states. May be empty."""
     smoothed, lagged = run.tables["smoothed"], run.tables["lagged"]
     final = smoothed.where(smoothed["kind"] == "final")
     if final.num_rows or not lagged.num_rows:
@@ -142,7 +143,7 @@ def later_states(run: Run) -> Columns:
 
 
 def _same(updates: Columns, revisions: Columns) -> tuple[IntArray, IntArray]:
-    """Return the row of each update, and the row of the update of each revision; -1 without an update."""
+    """Return the row of each update, and the row of the update that each revision changes; -1 if there is none."""
     n = updates.num_rows
     codes = np.zeros(n + revisions.num_rows, dtype=np.int64)
     for name in _KEY:
@@ -173,7 +174,7 @@ def _published(run: Run, options: EvaluationConfig) -> Columns:
 
 
 def _moved(run: Run, options: EvaluationConfig) -> BoolArray:
-    """Return for each compared state whether its later position is outside of its 95 % ellipse."""
+    """Return a mask of the compared states: True if the later position is outside of the published 95 % ellipse."""
     later, states = later_states(run), _published(run, options)
     before, after = neighbours(
         later, "stamp_ns", states["stamp_ns"], states["track_id"]
@@ -198,7 +199,7 @@ def _between(
 
 
 def _withdrawn(run: Run, options: EvaluationConfig) -> int:
-    """Return the number of published states whose track in the end did not exist then, or was never confirmed."""
+    """Return the number of published states whose track, in the end, begins later or was never confirmed."""
     final, states = run.tables["final_tracks"], _published(run, options)
     if not final.num_rows:
         return 0

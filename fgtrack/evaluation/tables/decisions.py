@@ -1,4 +1,4 @@
-"""Tables on decisions: what was taken back, and what is lost by wrong decisions."""
+"""Tables of decisions: revisions by late data, and errors by wrong decisions."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -10,7 +10,10 @@ from fgtrack.evaluation.tables import PERCENT, RUN, Column, Table
 
 
 def revisions_table(metrics: Mapping[str, Metrics]) -> Table:
-    """Return a row for each run: decisions and states that were taken back. Empty if no run has any to compare."""
+    """Return a table with the decisions and states of each run that late data has changed.
+
+    It is empty if no run has a changed decision, a compared state or a withdrawn state.
+    """
     records = []
     for label, item in metrics.items():
         of = item.revisions
@@ -50,9 +53,9 @@ def revisions_table(metrics: Mapping[str, Metrics]) -> Table:
         Column("withdrawn\nstates", "withdrawn_states"),
     ]
     notes = [
-        "revised: late data has changed the track of a detection; final after: from its arrival to its last change",
-        "moved: the later position at the same stamp is outside of the published 95 % ellipse; usual are 5 %",
-        "withdrawn: in the end the track does not exist at the stamp of the state, or was never confirmed",
+        "revised: late data has changed the track of the detection; final after: from its arrival to its last change",
+        "moved: the later position at the same stamp is outside of the published 95 % ellipse; 5 % are expected",
+        "withdrawn: in the end, the track does not exist at the stamp of the state, or was never confirmed",
     ]
     revised = any(record["changes"] for record in records)
     title = "Revisions (what was taken back)"
@@ -60,7 +63,10 @@ def revisions_table(metrics: Mapping[str, Metrics]) -> Table:
 
 
 def decisions_table(metrics: Mapping[str, Metrics]) -> Table:
-    """Return a row for each run with truth: wrong decisions, and the parts of decisions and estimates in the errors."""
+    """Return a table with the wrong decisions of each run with truth.
+
+    It also divides the position error into a part of the estimates and a part of the wrong decisions.
+    """
     records = []
     for label, item in metrics.items():
         of = item.decisions

@@ -148,7 +148,7 @@ def frame_of(header: RosMessage) -> Frame:
 def object_list(
     header: RosMessage, objects: Iterable[Detection], frame: Frame | None = None
 ) -> ObjectList:
-    """Return an object list with the stamp of `header`, and with the header's frame if `frame` is None."""
+    """Return an object list with the stamp of `header`, in `frame` or else in the frame of `header`."""
     return ObjectList(stamp_ns(header.stamp), frame or frame_of(header), tuple(objects))
 
 

@@ -102,7 +102,7 @@ def _along_sight(
 
 
 def paths_of(path: FieldPath) -> list[str]:
-    """Return the paths of the recorded fields of a component."""
+    """Return the paths of all recorded fields that `path` names; a component may be computed from several fields."""
     path = path.path if isinstance(path, Field) else path
     return [path] if isinstance(path, str) else list(path)
 

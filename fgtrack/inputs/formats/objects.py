@@ -45,8 +45,8 @@ _UNKNOWN = 1e3
 def detection3d_array(message: RosMessage) -> ObjectList:
     """Return the object list of a `vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
 
-    The pose is the box's; it is the first hypothesis's if the box has no size. The
-    covariance is the first hypothesis's.
+    Position and yaw are taken from the box, or from the first hypothesis if the box has
+    no size. The covariance is taken from the first hypothesis.
     """
     return object_list(message.header, map(_detection3d, message.detections))
 

@@ -236,7 +236,7 @@ class _Messages:
 
 
 def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
-    """Yield for each row of `file` its file and line, and its cells by column; the first one is the header.
+    """Yield file and line of each row, as `file:line`, and its cells by column. The first row is the header.
 
     Encoding, separator and decimal comma are inferred (`table_text`). Raises
     `DataError` if the file is not a table.

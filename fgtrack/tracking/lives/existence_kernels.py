@@ -87,10 +87,10 @@ def miss(
     could_show: BoolArray,
     expected_ns: IntArray,
 ) -> FloatArray:
-    """Note the `views` (m, sensors) of the tracks in `rows` that a list of `sensor` misses.
+    """Record that a list of `sensor` misses the tracks in `rows` (m,), and return likelihood ratios, shape (m,).
 
-    Returns the likelihood ratios of their existence, shape (m,): `ratio`, or NaN for a track out of the view of the
-    sensor.
+    `views` (m, sensors) is True for the sensors that could see a track. The ratio of existence
+    given the miss is `ratio`, or NaN for a track out of the view of the sensor.
     """
     _check(rows, lives, flags, could_show, expected_ns)
     check(len(views) == len(rows) and views.shape[1] == could_show.shape[1])
