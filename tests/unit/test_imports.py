@@ -54,6 +54,8 @@ def scripts() -> Iterator[tuple[str, str]]:
     """Paths and texts of the experiments, the example, the tutorials, and of the Python on the pages."""
     for path in sorted([*ROOT.glob("experiments/**/*.*"), *ROOT.glob("docs/**/*.*")]):
         name = path.relative_to(ROOT).as_posix()
+        if name.startswith("docs/generated/"):
+            continue
         if path.suffix == ".py":
             yield name, path.read_text(encoding="utf-8")
         elif path.suffix == ".md":
