@@ -1,7 +1,9 @@
 """An estimator that breaks one promise is found out by that promise, with measurements that show it."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -304,6 +306,14 @@ def test_every_broken_estimator_of_this_file_is_tested() -> None:
     assert broken == {each for each, _, _ in BROKEN}
 
 
+@cache
+def kept_promise(name: str) -> Callable[[], None]:
+    """Return the check of the nonlinear promise, which the shipped estimator passes."""
+    check = estimator_checks(name)[NEAR]
+    check()
+    return check
+
+
 #: Components of which the derivative is negated.
 ROWS = (
     "range_m",
@@ -322,8 +332,7 @@ def test_a_wrong_sign_in_a_row_of_the_measurement_jacobian_breaks_the_nonlinear_
     monkeypatch: pytest.MonkeyPatch, name: str, row: str
 ) -> None:
     """The estimator and all of its streams are as they are; the shipped measurement model alone is wrong."""
-    check = estimator_checks(name)[NEAR]
-    check()
+    check = kept_promise(name)
     negate_row(monkeypatch, row)
     with pytest.raises(BrokenPromiseError) as error:
         check()

@@ -351,7 +351,17 @@ def test_each_entry_of_a_measurement_jacobian_is_promised_by_name(
                 )
 
 
-@pytest.mark.parametrize("component", COMPONENTS)
+#: A component that a state holds, an angle that it holds, and a component that follows from the pose.
+FEW = ("x_m", "yaw_rad", "range_m")
+
+
+@pytest.mark.parametrize(
+    "component",
+    [
+        name if name in FEW else pytest.param(name, marks=pytest.mark.slow)
+        for name in COMPONENTS
+    ],
+)
 def test_a_fault_of_one_component_breaks_no_promise_of_another(
     monkeypatch: pytest.MonkeyPatch, component: str
 ) -> None:

@@ -149,7 +149,7 @@ def tracked(
 @pytest.mark.parametrize(
     ("estimator", "case"),
     each_once(
-        ["ekf-replay", "imm-replay", "smoother-banded", "smoother"],
+        ["imm-replay", "ekf-replay", "smoother-banded", "smoother"],
         [
             ((10.0, 10.0), 0.1, 2.0),
             ((25.0, 2.0), 0.6, 0.1),

@@ -12,6 +12,7 @@ import pytest
 from support import kitti
 from support.messages import START_NS, standing
 from support.paper import paper
+from support.pictures import with_blank_pictures
 
 from fgtrack.cli import study
 from fgtrack.cli.main import COMMANDS, _command, run
@@ -70,6 +71,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(study, "simulated", one_second)
+        with_blank_pictures(patch)
         write_stream("drive.jsonl", standing(30))
         write_stream("noisy.jsonl", noisy())
         write_stream("other.jsonl", standing(10))
@@ -85,13 +87,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("demo", "-o", "demo"),
             *(
                 words
-                for words, _ in WRITERS
+                for words, out in WRITERS
                 if words[0] in ("figure", "export", "info", "rank")
+                and not out.endswith(".pdf")
             ),
         ):
             assert run(list(words)) == 0
         # Any file stands for what the slow commands make.
-        for name in ("report.html", "tuned.yaml", "advised.yaml", "ledger.png"):
+        names = "report.html", "tuned.yaml", "advised.yaml", "ledger.png", "figures.pdf"
+        for name in names:
             Path(name).write_text("# before\n")
     return folder
 
@@ -102,6 +106,7 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = shutil.copytree(made, tmp_path / "here")
     monkeypatch.chdir(folder)
     monkeypatch.setattr(study, "simulated", one_second)
+    with_blank_pictures(monkeypatch)
 
     def redraw(named: object, folder: Path, form: str) -> list[Path]:
         return [

@@ -124,7 +124,10 @@ def test_the_adapter_of_the_page_runs_and_departs(tmp_path: Path) -> None:
     assert result.deviation > 1.0
 
 
-@pytest.mark.parametrize("scenario", ["range-bearing", "doppler"])
+@pytest.mark.parametrize(
+    "scenario",
+    [pytest.param("range-bearing", marks=pytest.mark.slow), "doppler"],
+)
 def test_an_innovation_of_an_observation_is_that_of_the_extended_filter(
     scenario: str,
 ) -> None:
@@ -184,12 +187,17 @@ def test_a_function_that_sorts_is_exact_now(tmp_path: Path) -> None:
     ("exact", "sabotage"),
     [
         ('each.stds["x_m"] ** 2', '1.21 * each.stds["x_m"] ** 2'),
-        ("H = np.eye(2, 4)", "H = 1.1 * np.eye(2, 4)"),
-        ("F @ P @ F.T + Q", "F @ P @ F.T + 0.9 * Q"),
         ("each.stamp_s", "each.receipt_s"),
-        ("known, key", "known[-20:], key"),
+        *(
+            pytest.param(*texts, marks=pytest.mark.slow)
+            for texts in (
+                ("H = np.eye(2, 4)", "H = 1.1 * np.eye(2, 4)"),
+                ("F @ P @ F.T + Q", "F @ P @ F.T + 0.9 * Q"),
+                ("known, key", "known[-20:], key"),
+            )
+        ),
     ],
-    ids=["noise", "H", "motion", "stamped at arrival", "forgetting"],
+    ids=["noise", "stamped at arrival", "H", "motion", "forgetting"],
 )
 def test_a_sabotaged_copy_of_an_exact_method_is_named_by_its_deviation(
     tmp_path: Path, exact: str, sabotage: str

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.pictures import with_blank_pictures
 from support.runs import replayed
 
 import fgtrack
@@ -264,7 +265,10 @@ def test_long_runs_are_thinned_and_it_is_reported(
     assert any(f"{NAMES[0]}, detections: " in note for note in notes)
 
 
-def test_names_from_outside_are_text(folder: Path, tmp_path: Path) -> None:
+def test_names_from_outside_are_text(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_blank_pictures(monkeypatch)
     strange = tmp_path / "<script>alert(1)<!-- & {{style}}"
     strange.mkdir()
     for file in (folder / "runs" / NAMES[0]).iterdir():

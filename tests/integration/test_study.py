@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from support.pictures import with_blank_pictures
 
 import fgtrack
 from fgtrack.cli.main import run as command
@@ -24,9 +25,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(recording: Path) -> Study:
     steps: list[tuple[str, float]] = []
-    found = fgtrack.study(
-        recording, recording.parent / "out", on_step=lambda *step: steps.append(step)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        with_blank_pictures(patch)
+        found = fgtrack.study(
+            recording,
+            recording.parent / "out",
+            on_step=lambda *step: steps.append(step),
+        )
     shares = [share for _, share in steps]
     assert shares == sorted(shares)
     assert shares[0] == 0.0

@@ -14,7 +14,7 @@ from support.traffic import Ticks, bits, gone_on, traffic
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.state import Stateful, copied, from_bytes, to_bytes
-from fgtrack.core.types import TickReport
+from fgtrack.core.types import DetectionList, TickReport
 from fgtrack.estimation.registry import ESTIMATORS, list_estimators
 from fgtrack.pipeline.live import Tracker
 
@@ -55,9 +55,9 @@ def largest_distance(ones: Sequence[TickReport], others: Sequence[TickReport]) -
 
 def random_split(name: str) -> tuple[Ticks, Ticks]:
     seed = sum(name.encode())
-    ticks = traffic(seed)
-    first = int(np.random.default_rng(seed).integers(20, 45))
-    return ticks[:first], ticks[first : first + 12]
+    first = int(np.random.default_rng(seed).integers(20, 35))
+    ticks = traffic(seed, first + 9)
+    return ticks[:first], ticks[first:]
 
 
 FAST = [name for name in list_estimators() if not name.startswith("smoother-batch")]
@@ -73,14 +73,13 @@ def test_a_restored_tracker_goes_on_with_the_same_bits_as_often_as_wanted(
     checkpoint = tracker.checkpoint()
     tracker.save(tmp_path / "tracker")
     expected = gone_on(tracker, after)
-    assert sum(len(each.tracks) for each in expected) > 12
-    runs = []
-    for _ in range(2):
-        tracker.restore(checkpoint)
-        runs.append(gone_on(tracker, after))
-    runs.append(gone_on(Tracker.load(tmp_path / "tracker"), after))
-    for run in runs:
-        assert bits(run) == bits(expected)
+    assert sum(len(each.tracks) for each in expected) > 9
+    tracker.restore(checkpoint)
+    assert bits(gone_on(tracker, after)) == bits(expected)
+    tracker.restore(checkpoint)  # as it was, though a tracker has gone on from it
+    assert bits(gone_on(tracker, after[:4])) == bits(expected[:4])
+    loaded = Tracker.load(tmp_path / "tracker")
+    assert bits(gone_on(loaded, after)) == bits(expected)
 
 
 @pytest.mark.slow
@@ -195,8 +194,14 @@ pickle.dump(bits(gone_on(Tracker.load(sys.argv[2]), ticks)), open(sys.argv[4], "
 @pytest.mark.long
 def test_a_saved_tracker_goes_on_in_another_process(tmp_path: Path) -> None:
     before, after = random_split("process")
-    before[-1][1].append(before[-1][1][-1])  # a copy is recognised there as well
-    after[0][1].append(before[-1][1][-1])
+    lists = [
+        each
+        for _, messages in before
+        for each in messages
+        if isinstance(each, DetectionList)
+    ]
+    before[-1][1].append(lists[-1])  # a copy is recognised there as well
+    after[0][1].append(lists[-1])
     tracker = tracker_of("ekf-replay")
     gone_on(tracker, before)
     tracker.save(tmp_path / "tracker")

@@ -1,15 +1,36 @@
 """What a figure shows as a picture: its texts, and whether any is cut off or lies on another."""
 
+import io
 from collections.abc import Iterator
 from itertools import combinations
+from pathlib import Path
+from typing import BinaryIO
 
+import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
+from PIL import Image
+
+from fgtrack.show.figures.style import StyledFigure
 
 _TOUCH_PX = 1.0
+
+
+def with_blank_pictures(patch: pytest.MonkeyPatch) -> None:
+    """Let figures be saved as small blank pictures, for tests of files whose pictures nobody looks at."""
+    blank = io.BytesIO()
+    Image.new("RGB", (4, 3), "white").save(blank, "PNG")
+
+    def savefig(_: StyledFigure, file: Path | BinaryIO, **options: object) -> None:
+        if isinstance(file, Path):
+            file.write_bytes(blank.getvalue())
+        else:
+            file.write(blank.getvalue())
+
+    patch.setattr(StyledFigure, "savefig", savefig)
 
 
 def faults(figure: Figure) -> list[str]:

@@ -246,7 +246,7 @@ def object_at(y_m: float) -> int:
     return round((y_m + 300.0) / 200.0)
 
 
-def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Outcome:
+def run(tracker: Tracker, *faults: Fault, num_ticks: int = 12) -> Outcome:
     """Run `lists` through a tracker, and one tick more without any; watch what its bank does."""
     outcome, guard = Outcome(), tracker._tracker._parts.bank
     update, claims = guard.update, Claims.of(ESTIMATORS.load(tracker.config.estimator))
@@ -266,17 +266,18 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
             each: known[each] for each in known if max(each, -1 - each) in track_ids
         }
 
+    def pause(paused: bool) -> None:
+        for fault in faults:
+            fault.paused = paused
+
     def watched(
         stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
-        if fault is not None:
-            fault.paused = True
+        pause(True)
         before = asked(track_ids, stamp_ns)
-        if fault is not None:
-            fault.paused = False
+        pause(False)
         results = update(stamp_ns, track_ids, measurements)
-        if fault is not None:
-            fault.paused = True
+        pause(True)
         after = asked(track_ids, stamp_ns)
         for track_id, result in zip(track_ids, results, strict=True):
             same = all(
@@ -295,16 +296,16 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
                 outcome.lies.append(
                     f"track {track_id} is {result.status}, but its state has changed"
                 )
-        if fault is not None:
-            fault.paused = False
+        pause(False)
         return results
 
     guard.update = watched  # type: ignore[method-assign]
     for k, messages in enumerate([*lists(num_ticks), []]):
         for message in messages:
             tracker.receive(message)
-        if fault is not None and k == num_ticks - 3:
-            fault.early_calls = fault.calls
+        if k == num_ticks - 3:
+            for fault in faults:
+                fault.early_calls = fault.calls
         try:
             report = tracker.tick(START_NS + 100 * k * MS)
         except BaseException as error:

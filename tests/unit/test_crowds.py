@@ -128,7 +128,11 @@ def test_an_association_is_that_of_all_pairs(bearings: bool, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "association", [GatedEuclidean(gate_m=5.0), GatedMahalanobis()]
+    "association",
+    [
+        pytest.param(GatedEuclidean(gate_m=5.0), marks=pytest.mark.slow),
+        GatedMahalanobis(),
+    ],
 )
 def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     association: GatedEuclidean | GatedMahalanobis,

@@ -46,7 +46,7 @@ def test_two_radars_are_mounted_by_a_camera_in_the_ego_frame() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_sensors_in_the_map_and_backwards_are_mounted(seed: int) -> None:
     sensors = (
         Sensor("lidar", form="map", half_view_rad=math.pi, range_std_m=0.2),
