@@ -38,7 +38,7 @@ _HOMES = {
     "HealthLimits": "fgtrack.pipeline.health",
     "HealthState": "fgtrack.pipeline.health",
     "IntArray": "fgtrack.core.types",
-    "Lateness": "fgtrack.pipeline.live",
+    "Lateness": "fgtrack.pipeline.live_statistics",
     "Ledger": "fgtrack.advice.ledger",
     "Measurement": "fgtrack.estimation.base",
     "MeasurementModel": "fgtrack.models.measurement",
@@ -66,7 +66,7 @@ _HOMES = {
     "Study": "fgtrack.recording_study",
     "Tables": "fgtrack.evaluation.tables",
     "TickReport": "fgtrack.core.types",
-    "TickTiming": "fgtrack.pipeline.live",
+    "TickTiming": "fgtrack.pipeline.live_statistics",
     "TrackBank": "fgtrack.estimation.base",
     "TrackReport": "fgtrack.core.types",
     "TrackState": "fgtrack.core.types",
@@ -217,9 +217,9 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.health import Revised as Revised
     from fgtrack.pipeline.health import SensorHealth as SensorHealth
     from fgtrack.pipeline.live import Checkpoint as Checkpoint
-    from fgtrack.pipeline.live import Lateness as Lateness
-    from fgtrack.pipeline.live import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker
+    from fgtrack.pipeline.live_statistics import Lateness as Lateness
+    from fgtrack.pipeline.live_statistics import TickTiming as TickTiming
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
     from fgtrack.pipeline.scored_sweep import sweep as sweep

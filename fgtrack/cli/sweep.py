@@ -50,7 +50,7 @@ def sweep(
     everything: All = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run settings x seeds x estimators into one table; resumes.
+    """Run a grid of settings, seeds and estimators, and write one table.
 
     Prints the mean and the standard error at each point of the grid, and which
     estimators are better.

@@ -138,9 +138,9 @@ def mean_square(ticks: FloatArray) -> Estimate:
 
 
 def sums_by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
-    """Sums of `samples` (n, k) over each stamp in ascending order, and in the last column their number.
+    """Return the sums of the `samples` (n, k) of each stamp, and their number in the last column, shape (m, k + 1).
 
-    A row with NaN is ignored.
+    The rows are in ascending order of the m distinct stamps. Samples with NaN are ignored.
     """
     known = np.isfinite(samples).all(axis=1)
     distinct, index = np.unique(stamps_ns, return_inverse=True)

@@ -26,7 +26,6 @@ from fgtrack.core.state import (
 )
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import (
-    Detection,
     DetectionList,
     Disposition,
     EgoState,
@@ -35,11 +34,6 @@ from fgtrack.core.types import (
     TickReport,
     TrackReport,
     UpdateRecord,
-)
-from fgtrack.inputs.validation import (
-    InvalidMessageError,
-    validated_detection,
-    validated_head,
 )
 from fgtrack.meaning.corrected import corrected, corrected_ego
 from fgtrack.pipeline.build import build_tracker
@@ -53,6 +47,8 @@ from fgtrack.pipeline.health import (
     overall,
     sensor_health,
 )
+from fgtrack.pipeline.live_statistics import Lateness, TickTiming, spread_s
+from fgtrack.pipeline.message_checks import MessageChecks, unreadable
 from fgtrack.pipeline.rehearsal import rehearse
 from fgtrack.runs import Node
 from fgtrack.tracking.lives.latency import NEWEST
@@ -62,13 +58,10 @@ from fgtrack.tracking.tracker_state import TrackerState
 if TYPE_CHECKING:
     from fgtrack.estimation.smoothing.window import Window
 
-__all__ = ["Checkpoint", "Lateness", "TickTiming", "Tracker"]
+__all__ = ["Checkpoint", "Tracker"]
 
-#: Number of unknown sensors that are counted by name; further unknown sensors are counted as `OTHERS`.
-MOST_UNKNOWN = 100
-OTHERS = "other sensors"
 #: First bytes of a file of a saved tracker, with the version of its contents.
-_MAGIC = b"fgtrack tracker 3\n"
+_MAGIC = b"fgtrack tracker 4\n"
 #: Largest lead of a receipt before the tick; a larger lead comes from a wrong clock. After a smaller lead the tracker
 #: recovers by itself when the clock reaches the receipt.
 MOST_AHEAD_NS = 60 * NS_PER_S
@@ -76,40 +69,6 @@ MOST_AHEAD_NS = 60 * NS_PER_S
 MOST_BACK_NS = NS_PER_S
 #: Number of ticks in a row by which a clock that was set back is recognised.
 NUM_BACK = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Lateness:
-    """Delays of the newest 1,000 messages of a sensor or of the ego: receipt minus the oldest stamp in the message."""
-
-    messages: int
-    """Number of all received messages."""
-    delay_median_s: float | None
-    """Median delay; None before the first message."""
-    delay_p99_s: float | None
-    """99th percentile of the delay."""
-    delay_worst_s: float | None
-    """Longest delay."""
-    silent_s: float
-    """Time from the newest receipt, or from the first tick before any receipt, to the last tick."""
-
-
-@dataclass(frozen=True, slots=True)
-class TickTiming:
-    """Durations of the newest 1,000 ticks, and missed deadlines."""
-
-    ticks: int
-    """Number of all ticks."""
-    median_s: float | None
-    """Median duration; None before the first tick."""
-    p99_s: float | None
-    """99th percentile of the duration."""
-    worst_s: float | None
-    """Longest duration."""
-    deadline_misses: int
-    """Ticks that were not finished when the next tick was due, as in a replay; 0 without `clock.node_hz`."""
-    skipped: int
-    """Node periods in which the host called no tick."""
 
 
 @dataclass(frozen=True)
@@ -120,18 +79,6 @@ class Checkpoint:
     """Counts, refused messages, timing and messages that wait for the next tick."""
     tracker: TrackerState
     config: Config
-
-
-def _spread_s(
-    newest_ns: Sequence[int],
-) -> tuple[float | None, float | None, float | None]:
-    """Return median, 99th percentile and maximum in s; None for each if there are no durations."""
-    if not newest_ns:
-        return None, None, None
-    median_s, p99_s, worst_s = (
-        np.quantile(newest_ns, (0.5, 0.99, 1.0)) / NS_PER_S
-    ).tolist()
-    return median_s, p99_s, worst_s
 
 
 class Tracker:
@@ -161,8 +108,7 @@ class Tracker:
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
-        "_refused",
-        "_unknown",
+        "_checks",
         "_records",
         "_revisions",
         "_counts",
@@ -198,8 +144,7 @@ class Tracker:
         rehearse(config)
         self.config = config
         self._tracker = self._built(0)
-        self._refused: Counter[str] = Counter()
-        self._unknown: dict[str, None] = {}
+        self._checks = MessageChecks(config)
         self._records: list[UpdateRecord] = []
         self._revisions: list[Revision] = []
         self._counts: dict[str, Counter[str]] = {}
@@ -258,7 +203,7 @@ class Tracker:
         """Numbers of messages and ticks that were not used, by reason."""
         with self._turn:
             self._take_arrivals()
-            return self._refused + self._tracker.refused_ego
+            return self._checks.refused + self._tracker.refused_ego
 
     @property
     def counts(self) -> Mapping[str, Mapping[str, int]]:
@@ -305,7 +250,7 @@ class Tracker:
                 )
                 silent_s = max(seconds(self._last.now_ns - since_ns), 0.0)
                 result[name] = Lateness(
-                    one.messages, *_spread_s(one.newest_ns), silent_s
+                    one.messages, *spread_s(one.newest_ns), silent_s
                 )
             return result
 
@@ -334,7 +279,7 @@ class Tracker:
     def _late_ego(self) -> Iterator[str]:
         """Yield the warning about a late ego, from the newest messages."""
         delays_s = {
-            name: _spread_s(self._tracker.delays[name].newest_ns)[0]
+            name: spread_s(self._tracker.delays[name].newest_ns)[0]
             for name in (EGO, *self._need_ego)
         }
         medians_s = {
@@ -409,7 +354,7 @@ class Tracker:
         with self._turn:
             return TickTiming(
                 self._last.tick + 1,
-                *_spread_s(self._ticks_ns),
+                *spread_s(self._ticks_ns),
                 self._node.misses,
                 self._skipped,
             )
@@ -430,7 +375,7 @@ class Tracker:
         for _ in range(len(self._arrivals)):  # messages that arrive meanwhile may wait
             arrival = self._arrivals[0]
             if arrival is not self._taken:
-                ready, refused = self._validated(arrival[0])
+                ready, refused = self._checks.checked(arrival[0])
                 all_ready, all_records = [*self._ready, *ready], self._records + refused
                 self._ready, self._records, self._taken = (
                     all_ready,
@@ -438,55 +383,6 @@ class Tracker:
                     arrival,
                 )
             self._arrivals.popleft()
-
-    def _validated(
-        self, message: EgoState | DetectionList
-    ) -> tuple[list[EgoState | DetectionList], list[UpdateRecord]]:
-        """Return the valid message, if it is one, and the records of its detections if it is refused."""
-        try:
-            return self._valid(message), []
-        except InvalidMessageError as error:
-            is_list = isinstance(message, DetectionList)
-            kind = "object list" if is_list else "ego state"
-            return [], self._refused_records(message, f"{kind}: {_rule(error)}")
-        except _RefusedError as error:
-            return [], self._refused_records(message, str(error))
-        except Exception as error:
-            return [], self._refused_records(message, _unreadable(error))
-
-    def _refused_records(
-        self, message: EgoState | DetectionList, reason: str
-    ) -> list[UpdateRecord]:
-        """Count a message that is not used; return the records of its detections, which are invalid."""
-        self._refused[reason] += 1
-        if not isinstance(message, DetectionList):
-            return []
-        sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
-        times_ns = _recorded_ns(message.stamp_ns), _recorded_ns(message.receipt_ns)
-        return [
-            UpdateRecord(sensor, *times_ns, row, Disposition.INVALID)
-            for row in range(len(message.objects))
-        ]
-
-    def _valid(
-        self, message: EgoState | DetectionList
-    ) -> list[EgoState | DetectionList]:
-        """Return the valid message; nothing of an ignored sensor. Raises for other messages."""
-        if not isinstance(message, EgoState | DetectionList):
-            raise _RefusedError("neither ego state nor object list")
-        message = validated_head(message)
-        for name in ("stamp_ns", "receipt_ns"):
-            if not 0 <= getattr(message, name) <= LARGEST_NS:
-                raise InvalidMessageError(f"{name}: nanoseconds since 1970 expected")
-        if isinstance(message, EgoState):
-            return [message]
-        if message.sensor not in self.config.sensors:
-            if message.sensor in self.config.ignore_sensors:
-                return []
-            name = self._name_for_counts(message.sensor)
-            raise _RefusedError(f"sensor {name!r} has no model")
-        objects = tuple(map(self._valid_detection, message.objects))
-        return [replace(message, objects=objects)]
 
     def _deliver(self, now_ns: int) -> None:
         """Pass all valid messages to the tracker; none may be received after the tick at `now_ns`.
@@ -500,7 +396,7 @@ class Tracker:
             try:
                 due.append(self._corrected(message, now_ns))
             except Exception as error:
-                records += self._refused_records(message, _unreadable(error))
+                records += self._checks.refuse(message, unreadable(error))
         self._ready, self._due, self._records = [], due, records
         tracker = self._tracker
         # An interrupt may have left messages here that the tracker has received.
@@ -509,7 +405,7 @@ class Tracker:
             try:
                 tracker.receive(message)
             except Exception as error:
-                refused = self._refused_records(message, _unreadable(error))
+                refused = self._checks.refuse(message, unreadable(error))
                 records = self._records + refused
                 self._records, tracker.received = records, message
         self._due = []
@@ -531,23 +427,6 @@ class Tracker:
             self._need_ego[message.sensor] = None
         return message
 
-    def _name_for_counts(self, sensor: str) -> str:
-        """Return the name under which a sensor is counted: unknown sensors beyond the first 100 share a name."""
-        if sensor in self.config.sensors or sensor in self._unknown:
-            return sensor
-        if len(self._unknown) == MOST_UNKNOWN:
-            return OTHERS
-        self._unknown[sensor] = None
-        return sensor
-
-    def _valid_detection(self, item: Detection) -> Detection:
-        """Return `item` with plain values; a detection without values if it has wrong types."""
-        try:
-            return validated_detection(item)
-        except InvalidMessageError as error:
-            self._refused[f"detection: {_rule(error)}"] += 1
-            return Detection()
-
     def tick(self, now_ns: int) -> TickReport:
         """Process all received messages, and predict all tracks to `now_ns`; raises `CallError` for an invalid time.
 
@@ -562,7 +441,7 @@ class Tracker:
                 is_far = self._last.now_ns - now_ns > MOST_BACK_NS
                 self._num_back = self._num_back + 1 if is_far else 0
                 if self._num_back < NUM_BACK:
-                    self._refused["tick before the last one"] += 1
+                    self._checks.refused["tick before the last one"] += 1
                     return replace(self._last, updates=(), smoothed=(), revisions=())
                 self._start_over(now_ns)
             begun_ns = perf_counter_ns()
@@ -618,10 +497,10 @@ class Tracker:
                 kept.append(message)
             else:
                 reason = "received before the clock was set back"
-                self._records += self._refused_records(message, reason)
+                self._records += self._checks.refuse(message, reason)
         self._due, self._ready = [], kept
-        self._refused["clock was set back, tracks ended"] += 1
-        self._refused += former.refused_ego
+        self._checks.refused["clock was set back, tracks ended"] += 1
+        self._checks.refused += former.refused_ego
         self._failed_before = Counter(self.failures)
         self._tracker = self._built(self._newest_id + 1)
         self._watch = Watch(self.config.sensors)
@@ -748,7 +627,7 @@ class Tracker:
         counts = Counter((update.sensor, str(update.disposition)) for update in updates)
         result = {sensor: counter.copy() for sensor, counter in self._counts.items()}
         for (sensor, disposition), count in counts.items():
-            name = self._name_for_counts(sensor)
+            name = self._checks.name_for_counts(sensor)
             result.setdefault(name, Counter())[disposition] += count
         return result
 
@@ -763,28 +642,6 @@ def _newest_id(records: Iterable[UpdateRecord]) -> int:
         ),
         default=-1,
     )
-
-
-class _RefusedError(Exception):
-    """A message that is not used, with the reason."""
-
-
-def _rule(error: InvalidMessageError) -> str:
-    """Return the expected value in the message of `error`, without the given value, so that reasons can be counted."""
-    return str(error).partition(", not ")[0]
-
-
-def _unreadable(error: Exception) -> str:
-    """Return the reason why a message is not used that raised `error`."""
-    return f"message cannot be read ({type(error).__name__})"
-
-
-def _recorded_ns(value: object) -> int:
-    """Return a time of a refused message for its records; 0 if it is not an integer."""
-    try:
-        return integer(value)  # type: ignore[arg-type]  # any received object
-    except Exception:
-        return 0
 
 
 def _track_id(value: int) -> int:

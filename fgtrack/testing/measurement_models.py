@@ -49,7 +49,7 @@ class Case(NamedTuple):
 
     @property
     def expected(self) -> Linearisation:
-        """The measurement by its definition."""
+        """Predicted measurement and its Jacobians, by the equations that define the components."""
         return equations.linearised(
             self.model.components, self.model.state_names, self.x, self.pose
         )

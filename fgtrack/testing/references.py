@@ -255,10 +255,10 @@ def rounding_bound(
 ) -> float:
     """Bound of the rounding errors, in standard deviations, of a solver that divides by a linear model's process noise.
 
-    Given its end, the start of a segment is known to 1 / W = sqrt(Q_xx) / 2, 3e-11 m for 1 us of CV; beside a row that
-    weighs W an orthogonal factorisation keeps one of a measurement of `sigma_m` to eps W sigma only. Ten times that,
-    for the shortest segment between `stamps_ns`. A filter in covariance form divides by no process noise and needs no
-    such bound.
+    The process noise of a short segment ties its start to its end with the weight W = 2 / sqrt(Q_xx), for example
+    1 / 3e-11 m for CV and 1 us. Rows of this weight round the row of a measurement with the standard deviation
+    `sigma_m` by eps W sigma_m in an orthogonal factorisation. The bound is ten times this error, for the shortest
+    segment between `stamps_ns`. A filter in covariance form does not divide by process noise, and needs no bound.
     """
     gaps_ns = np.diff(sorted(set(stamps_ns)))
     if not gaps_ns.size:

@@ -20,6 +20,7 @@ START_NS = 1_600_000_000_000_000_000
 #: Modules that hand detections on. All others are called by them, and hold none.
 HOLDERS = (
     "pipeline/live.py",
+    "pipeline/message_checks.py",
     "tracking/inbox.py",
     "tracking/list_update.py",
     "tracking/publication.py",

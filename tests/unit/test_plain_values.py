@@ -21,7 +21,8 @@ from fgtrack.inputs.source import open_input
 from fgtrack.inputs.validation import InvalidMessageError, validated_message
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.pipeline.live import MOST_UNKNOWN, OTHERS, Tracker
+from fgtrack.pipeline.live import Tracker
+from fgtrack.pipeline.message_checks import MOST_UNKNOWN, OTHERS
 
 MS = 1_000_000
 NOW_NS = 1_600_000_000_000_000_000

@@ -18,7 +18,8 @@ from fgtrack.core.types import (
     TrackReport,
     TruthState,
 )
-from fgtrack.pipeline.live import TickTiming, Tracker
+from fgtrack.pipeline.live import Tracker
+from fgtrack.pipeline.live_statistics import TickTiming
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.preprocess import Preprocess, Preprocessed
 

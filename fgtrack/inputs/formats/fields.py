@@ -58,7 +58,10 @@ class FieldError(Exception):
 def mapped(
     fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
 ) -> dict[str, Any]:  # Any: arguments of `EgoState`, `Detection` and `TruthState`
-    """Return the mapped components among `names`, by name; `read` returns the recorded value at a path, or None."""
+    """Return the values of the components in `names` that `fields` maps to recorded fields, by name.
+
+    `read` returns the recorded value at a path, or None if it is missing.
+    """
     values = {
         name: _component(name, fields[name], read)
         for name in names

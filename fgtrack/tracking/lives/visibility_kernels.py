@@ -98,8 +98,8 @@ def existing_at(
 ) -> float:
     """Return the probability that the object of track `own` exists at `stamp_ns`.
 
-    It follows from all evidence. If `is_known`, it follows from the evidence up to the stamp. A newer list that could
-    not show the object is no evidence.
+    All evidence counts, or only the evidence up to the stamp if `is_known`. A newer list that could not show the object
+    is no evidence.
     """
     k = counts[own] - 1
     while (
