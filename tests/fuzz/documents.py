@@ -35,10 +35,10 @@ def changed(
         list[str](),
     )
     document = form.read(content)
+    before = form.write(document)
     for _ in range(_ATTEMPTS * count):
         if len(said) == count:
             break
-        before = form.write(document)
         try:
             what = values.change(rng, document)
             content = form.write(document)
@@ -46,6 +46,7 @@ def changed(
             document = form.read(before)
         else:
             said.append(f"{name}{what}")
+            before = content
     return content, said
 
 
