@@ -163,9 +163,7 @@ def assert_same_output(found: str, shown: str, where: str) -> None:
             assert word == wanted, f"{where} prints\n{found}"
 
 
-@pytest.mark.parametrize(
-    "tutorial", [TUTORIALS[0], *slow(*TUTORIALS[1:])], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("tutorial", slow(*TUTORIALS), ids=lambda path: path.stem)
 def test_tutorials_run(
     tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
