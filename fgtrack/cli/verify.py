@@ -1,4 +1,4 @@
-"""`fgtrack verify`: runs the contract suites over estimators, motion models and measurement models."""
+"""`fgtrack verify`: runs the contract suites over estimators, whole trackers, motion models and measurement models."""
 
 from typing import Annotated
 
@@ -17,6 +17,7 @@ from fgtrack.testing import (
     estimator_checks,
     measurement_model_checks,
     motion_model_checks,
+    tracker_checks,
 )
 
 _COLUMNS = (
@@ -37,8 +38,9 @@ def verify(
 
     Checks all installed estimators and motion models, plug-ins included, and all
     measured components. Estimators are compared with direct calculations, shipped
-    models with their differential equations and definitions. Exit code 1 if a promise
-    is broken.
+    models with their differential equations and definitions. A whole tracker with each
+    exact estimator is compared with itself on messages in order. Exit code 1 if a
+    promise is broken.
     """
     names = list(ESTIMATORS.loaded()) if name is None else [ESTIMATORS.resolve(name)]
     broken: dict[str, dict[str, str]] = {}
@@ -46,7 +48,7 @@ def verify(
         suites = {
             each: (
                 Claims.of(ESTIMATORS.load(each)).exact,
-                estimator_checks(each, num_streams=2),
+                estimator_checks(each, num_streams=2) | tracker_checks(each),
             )
             for each in names
         }

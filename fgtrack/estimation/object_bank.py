@@ -199,6 +199,17 @@ class ObjectBank(Stateful, Generic[_E]):
         """See `TrackBank.remove`."""
         del self._estimators[track_id], self._starts[track_id]
 
+    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
+        """Undo the fusion of a measurement. Return False if the estimator cannot, or does not have the measurement."""
+        withdraw = getattr(self._estimators[track_id], "withdraw", None)
+        if withdraw is None:
+            return False
+        try:
+            withdraw(measurement)
+        except CallError:
+            return False
+        return True
+
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`. An object whose first stamp is after the present has its first state."""
         states = self._ask(

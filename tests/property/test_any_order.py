@@ -5,7 +5,9 @@ from typing import Any
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from support.any_order import KINDS, assert_equal, drawn, outcome
+
+from fgtrack.testing.drawn_scenes import KINDS, drawn
+from fgtrack.testing.outcomes import CONVERGED, Tolerance, difference, outcome
 
 #: Drawn scenes are not shrunk: it takes minutes.
 DRAWN = (Phase.explicit, Phase.generate)
@@ -39,11 +41,16 @@ def check(
     seed: int,
     late_ego_s: float,
     estimator: str = "ekf-replay",
-    atol_m: float = 0.0,
+    tolerance: Tolerance | None = None,
 ) -> None:
     """Assert that late messages give the tracks of the messages in order."""
     scene = drawn(**drawing).with_estimator(estimator)
-    assert_equal(outcome(scene.late(seed, 0.9, late_ego_s)), outcome(scene), atol_m)
+    assert (
+        difference(
+            outcome(scene.late(seed, 0.9, late_ego_s)), outcome(scene), tolerance
+        )
+        == ""
+    )
 
 
 @settings(max_examples=3, deadline=None, phases=DRAWN, derandomize=True)
@@ -76,4 +83,4 @@ def test_any_order_with_smoothers(
 ) -> None:
     # One step per yaw is far from converged.
     kinds = ["position" if each == "yaw" else each for each in drawing["kinds"]]
-    check({**drawing, "kinds": kinds}, seed, late_ego_s, estimator, 1e-3)
+    check({**drawing, "kinds": kinds}, seed, late_ego_s, estimator, CONVERGED)

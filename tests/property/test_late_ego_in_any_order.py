@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from support.any_order import assert_equal, drawn, outcome
+
+from fgtrack.testing.drawn_scenes import drawn
+from fgtrack.testing.outcomes import difference, outcome
 
 LOW_PASS: Mapping[str, Any] = {"yaw_weight": 0.7, "yaw_rate_weight": 0.5}
 SPEED = {"speed_std_mps": 10.0, "ego_speed_factor": 1.0, "slow_ego_mps": 20.0}
@@ -23,8 +25,8 @@ def test_late_poses_give_the_tracks_of_a_stream_in_order(
 ) -> None:
     scene = drawn(seed, num_objects=4, length_s=3.5, frame=frame, **config)
     in_order = outcome(scene)
-    assert_equal(outcome(scene.late(seed, 0.0, 0.4)), in_order)
-    assert_equal(outcome(scene.late(seed, 0.8, 0.4)), in_order)
+    assert difference(outcome(scene.late(seed, 0.0, 0.4)), in_order) == ""
+    assert difference(outcome(scene.late(seed, 0.8, 0.4)), in_order) == ""
 
 
 def test_a_list_before_the_first_ego_state_is_used_once_it_has_come() -> None:
@@ -36,7 +38,7 @@ def test_a_list_before_the_first_ego_state_is_used_once_it_has_come() -> None:
     delayed = scene.late(3, 0.0, 0.9)
     found = outcome(delayed)
     assert {each.disposition.value for each in found.records} >= {"failed"}
-    assert_equal(found, in_order)
+    assert difference(found, in_order) == ""
 
 
 @pytest.mark.slow
@@ -51,4 +53,4 @@ def test_a_list_before_the_first_ego_state_is_used_once_it_has_come() -> None:
 def test_late_poses_in_many_scenes(seed: int, config: Mapping[str, Any]) -> None:
     kinds = ("range_bearing", "position") if seed % 2 else ("position", "bearing")
     scene = drawn(seed, kinds, num_objects=1 + seed % 12, **config)
-    assert_equal(outcome(scene.late(seed, 0.9, 0.5)), outcome(scene))
+    assert difference(outcome(scene.late(seed, 0.9, 0.5)), outcome(scene)) == ""

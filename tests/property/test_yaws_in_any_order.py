@@ -3,7 +3,9 @@
 from typing import Any
 
 import pytest
-from support.any_order import assert_equal, drawn, outcome
+
+from fgtrack.testing.drawn_scenes import drawn
+from fgtrack.testing.outcomes import difference, outcome
 
 CTRV: dict[str, Any] = {
     "kind": "ctrv",
@@ -21,4 +23,4 @@ def test_late_lists_change_no_reading_of_a_yaw(seed: int) -> None:
         frame="map",
         motion=CTRV,
     )
-    assert_equal(outcome(scene.late(seed, 0.9, 0.3)), outcome(scene))
+    assert difference(outcome(scene.late(seed, 0.9, 0.3)), outcome(scene)) == ""

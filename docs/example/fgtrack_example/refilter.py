@@ -3,6 +3,7 @@
 import numpy as np
 
 from fgtrack import (
+    CallError,
     Measurement,
     MotionModel,
     Start,
@@ -42,6 +43,12 @@ class Refilter:
         late = measurement.stamp_ns < newest_ns
         status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
         return UpdateResult(status, y, measurement.nis(y, S))
+
+    def withdraw(self, measurement: Measurement) -> None:
+        kept = [each for each in self.measurements if each.order != measurement.order]
+        if len(kept) == len(self.measurements):
+            raise CallError("withdraw: the window has no such measurement")
+        self.measurements = kept
 
     def state_at(self, stamp_ns: int) -> TrackState:
         state = self.first

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import ClassVar, NamedTuple
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, asked_stamp
@@ -96,15 +97,33 @@ class ReplayEkf(WindowedFilter):
 
     def has_fused(self, measurement: Measurement) -> bool:
         """True if the window has an identical measurement."""
+        return self._index_of(measurement) is not None
+
+    def withdraw(self, measurement: Measurement) -> None:
+        """Filter without a measurement, as if it had never been fused.
+
+        Raises `CallError` if the window does not have the measurement.
+        """
+        index = self._index_of(measurement)
+        if not index:
+            raise CallError(
+                f"withdraw: the window has no such measurement at {measurement.stamp_ns} ns"
+            )
+        before, later = self.steps[index - 1], self.steps[index + 1 :]
+        self.steps[index - 1 :] = self._filtered(before, later)
+
+    def _index_of(self, measurement: Measurement) -> int | None:
+        """Return the index of the step with an identical measurement; None without one."""
         stamp_ns = measurement.stamp_ns
         if stamp_ns < self._start_ns:
-            return False
+            return None
         first = bisect.bisect_left(self.steps, stamp_ns, key=by_stamp)
         last = bisect.bisect_right(self.steps, stamp_ns, key=by_stamp)
-        fused = [step.measurement for step in self.steps[first:last]]
-        return any(
-            each is not None and each.order == measurement.order for each in fused
-        )
+        for index in range(first, last):
+            own = self.steps[index].measurement
+            if own is not None and own.order == measurement.order:
+                return index
+        return None
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         stamp_ns = (
@@ -125,12 +144,16 @@ class ReplayEkf(WindowedFilter):
             correction = correction._replace(
                 innovation=expected.innovation, nis=expected.nis, S=expected.S
             )
-        chain = [step]
+        self.steps[index:] = self._filtered(step, later)
+        return correction
+
+    def _filtered(self, first: Step, later: Sequence[Step]) -> list[Step]:
+        """Return the step `first`, and the measurements of the steps `later` filtered after it."""
+        chain = [first]
         for each in later:
             if each.measurement is not None:
                 chain.append(self._step(chain[-1], each.measurement)[0])
-        self.steps[index:] = chain
-        return correction
+        return chain
 
     def predict(
         self, mean: FloatArray, covariance: FloatArray, dt_s: float

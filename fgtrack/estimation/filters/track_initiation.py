@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from fgtrack.core.checks import as_stamp
+from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, polar
 from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.time import seconds
@@ -263,6 +264,16 @@ class Initiated(Stateful):
             )
             self._begin_again(self._search)
         return result
+
+    def withdraw(self, measurement: Measurement) -> None:
+        """Undo the fusion of a measurement.
+
+        Raises `CallError` while the direction of travel is sought, and for an estimator that cannot do it.
+        """
+        withdraw = getattr(self._inner, "withdraw", None)
+        if self._search is not None or withdraw is None:
+            raise CallError("withdraw: this estimator cannot withdraw the measurement")
+        withdraw(measurement)
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""

@@ -5,6 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from fgtrack.core.errors import CallError
+from fgtrack.core.linalg import congruence, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, asked_stamp
@@ -71,6 +73,26 @@ class AccumulatedStateDensity(WindowedFilter):
         result = fuse_across(mean, covariance, past, measurement)
         self._stack = stamps_ns, result.mean, result.covariance
         return result
+
+    def withdraw(self, measurement: Measurement) -> None:
+        """Undo the fusion of a measurement, which must have been fused.
+
+        Its information is subtracted: P- = P + P H' (R - H P H')^-1 H P, x- = x - P H' (R - H P H')^-1 (z - H x).
+        Raises `CallError` for a stamp without a state, and for a robust loss, whose weight is unknown.
+        """
+        measurement = measurement.seen_by(self._motion)
+        if measurement.stamp_ns not in self._stack[0] or measurement.loss is not None:
+            raise CallError(
+                f"withdraw: the measurement at {measurement.stamp_ns} ns cannot be subtracted"
+            )
+        (stamps_ns, mean, covariance), block = self._with_state(measurement.stamp_ns)
+        own = measurement.model
+        y, H = own.linearised(measurement.z, mean[block], measurement.pose)
+        across = covariance[:, block] @ H.T
+        rest = measurement.R - congruence(H, covariance[block, block])
+        gain = psd_solve(symmetrise(rest), across.T).T
+        without = symmetrise(covariance + gain @ across.T)
+        self._stack = stamps_ns, mean - gain @ y, without
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
         """Return the stack with a state at `stamp_ns`, and the slice of this state in the stack."""
