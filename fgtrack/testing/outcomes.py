@@ -1,4 +1,4 @@
-"""Tracks that a tracker has found in the end, and how they differ from the tracks of another one."""
+"""Final tracks of a tracker, and their differences from the final tracks of another tracker."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ USED = frozenset(
 
 @dataclass
 class Outcome:
-    """Tracks and states that a tracker has found in the end. A track is named by its first detection."""
+    """Final tracks and states of a tracker. A track is named by its first detection."""
 
     states: dict[tuple[Key, int], tuple[FloatArray, FloatArray]]
     """Mean and covariance of each track at several stamps, by the track and the stamp."""
@@ -57,7 +57,7 @@ class Outcome:
 
 
 def outcome(scene: Scene, build: Build = build_tracker) -> Outcome:
-    """Return what a tracker that `build` makes finds in a scene."""
+    """Return the final tracks in a scene of the tracker that `build` makes."""
     tracker = build(Config.from_dict(scene.config))
     records, revisions = _fed(tracker, scene)
     reports: list[tuple[int, TrackReport]] = []
