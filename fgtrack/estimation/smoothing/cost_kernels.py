@@ -29,7 +29,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     LOSS,
     NODES,
     NUM_ROWS,
-    ORIGIN,
     PREDICTED,
     SEEN,
     SIZE,
@@ -102,7 +101,7 @@ def window_cost(
     The process noise is that of the linearisation points. NaN if a covariance is not positive definite.
     """
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
-    n = points.shape[2]
+    n = points.shape[1]
     check_track(track, nodes, 0)
     check_seen(nodes, seen)
     check_noise(kind, noise, n)
@@ -117,7 +116,7 @@ def window_cost(
             x[i] = means[index - first, i]
         if index == first:
             for i in range(n):
-                gap[i] = x[i] - points[oldest, ORIGIN, i]
+                gap[i] = x[i] - points[oldest, i]
                 gap[i] -= blocks[oldest, PREDICTED][i, n]
             copy(blocks[oldest, PREDICTED], S)
             total += 0.5 * whiten(S, gap)

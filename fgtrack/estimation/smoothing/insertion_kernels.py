@@ -6,7 +6,6 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.node_arrays import (
     AHEAD_S,
     BEGIN_NS,
-    CHANGED,
     CODE,
     COUNT,
     FIRST,
@@ -19,7 +18,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     NONLINEAR,
     NUM_PLUGINS,
     NUM_ROWS,
-    ORIGIN,
     PLUGIN,
     POSE,
     ROOT,
@@ -130,7 +128,7 @@ def _insert(
     labels[at, NUM_ROWS], labels[at, NUM_PLUGINS], labels[at, ROWS_STALE] = 0, 0, 0
     labels[numbers[track, index - 1], STALE] = 1
     for i in range(len(mean)):
-        points[at, ORIGIN, i] = mean[i]
+        points[at, i] = mean[i]
 
 
 @merged
@@ -183,8 +181,7 @@ def _write_rows(
         own[i, n] = y[i]
         for j in range(n):
             own[i, j] = H[i, j]
-            own[i, n] += H[i, j] * (mean[j] - points[at, ORIGIN, j])
-    labels[at, CHANGED] = 1
+            own[i, n] += H[i, j] * (mean[j] - points[at, j])
     forward(L, own)
 
 
@@ -218,7 +215,7 @@ def place(
     """
     info, all_ns, numbers, labels, _, points, _, rows = nodes
     y, H, means = linearised
-    m, n, k, flags = len(tracks), points.shape[2], y.shape[1], 0
+    m, n, k, flags = len(tracks), points.shape[1], y.shape[1], 0
     check_nodes(tracks, nodes, 1)
     check_seen(nodes, seen)
     check_indices(anchors, tracks, nodes)

@@ -22,7 +22,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     INDICES,
     MATRICES,
     NODES,
-    ORIGIN,
     TIMES,
     VECTORS,
     Arrays,
@@ -69,7 +68,7 @@ def locate(
 
 
 @shared(
-    f"b1({MATRICES}, {BLOCKS}, {MATRICES}, int64, int64, {_STATE}, {_STATE}, {MATRICES})"
+    f"b1({VECTORS}, {BLOCKS}, {MATRICES}, int64, int64, {_STATE}, {_STATE}, {MATRICES})"
 )
 def _interpolate(
     points: FloatArray,
@@ -115,7 +114,7 @@ def _interpolate(
     complement(Psi, F2, E)
     for i in range(n):
         for j in range(n):
-            mean[i] += Psi[i, j] * (points[at, ORIGIN, j] + backs[at, n, j] - ahead[j])
+            mean[i] += Psi[i, j] * (points[at, j] + backs[at, n, j] - ahead[j])
     product(E, F1, Lambda)
     product(Lambda, backs[before], by_right)
     for i in range(n):
@@ -164,7 +163,7 @@ def arrive(
         )
     )
     check(
-        n == points.shape[2]
+        n == points.shape[1]
         and ahead.shape[1] == n
         and F1.shape[1:] == (n, n)
         and Q1.shape[1:] == (n, n)

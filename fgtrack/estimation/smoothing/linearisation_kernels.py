@@ -15,7 +15,6 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.node_arrays import (
     AHEAD_S,
-    CHANGED,
     CODE,
     COUNT,
     INDICES,
@@ -24,7 +23,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     NONLINEAR,
     NUM_PLUGINS,
     NUM_ROWS,
-    ORIGIN,
     POSE,
     ROOT,
     ROWS_STALE,
@@ -158,7 +156,7 @@ def _linearise_rows(
     out, L, row = space[0], space[4], 0
     while row < labels[at, NUM_ROWS]:
         k = marks[SIZE, row]
-        observe_at(kind, noise, points[at, ORIGIN], marks, values, row, space)
+        observe_at(kind, noise, points[at], marks, values, row, space)
         whiten_rows(marks, values, row, out, L)
         _, weight = penalty_and_weight(
             marks[LOSS, row], values[WIDTH, row], length(out, k)
@@ -168,7 +166,6 @@ def _linearise_rows(
             for j in range(out.shape[1]):
                 rows[at, row + a, j] = share * out[a, j]
         row += k
-    labels[at, CHANGED] = 1
 
 
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES}, {SEEN})")
@@ -186,7 +183,7 @@ def linearise(
     as they are.
     """
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
-    n = points.shape[2]
+    n = points.shape[1]
     check_nodes(tracks, nodes, 0)
     check_seen(nodes, seen)
     check(len(starts) >= len(tracks))
@@ -205,9 +202,8 @@ def linearise(
                 dt_s = (all_ns[track, index + 1] - all_ns[track, index]) / NS_PER_S
                 motion = blocks[at, F]
                 transition(
-                    kind, points[at, ORIGIN], dt_s, noise, mean, motion, blocks[at, Q]
+                    kind, points[at], dt_s, noise, mean, motion, blocks[at, Q]
                 )
                 for i in range(n):
                     motion[i, n] = mean[i]
-                labels[at, CHANGED] = 1
             labels[at, STALE] = 0

@@ -22,10 +22,9 @@ COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Levels of `NONLINEAR`: linear tracks, tracks with a nonlinear measurement, and with a robust loss.
 NUM_LEVELS = 3
 #: Columns of `labels`.
-NUM_ROWS, CHANGED, STALE, ROWS_STALE, NUM_PLUGINS = range(5)
-#: Rows of `points` of a node, and its `blocks`.
-ORIGIN, REFERENCE = range(2)
-C, FILTERED, PREDICTED, P, F, Q = range(6)
+NUM_ROWS, STALE, ROWS_STALE, NUM_PLUGINS = range(4)
+#: `blocks` of a node.
+C, FILTERED, PREDICTED, P, F, Q, INFORMATION = range(7)
 #: Rows of `marks`, rows of `values`, and the number of rows of `values`.
 CODE, SIZE, LOSS = range(3)
 Z, POSE, WIDTH, AHEAD_S, ROOT = 0, 1, 1 + POSE_SIZE, 2 + POSE_SIZE, 3 + POSE_SIZE
@@ -40,7 +39,7 @@ INDICES, TIMES, VECTORS, MATRICES = (
     "float64[:, :, ::1]",
 )
 BLOCKS = "float64[:, :, :, ::1]"
-NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {BLOCKS}, {MATRICES}))"
+NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {VECTORS}, {BLOCKS}, {MATRICES}))"
 Arrays = tuple[
     IntArray,
     IntArray,
@@ -64,7 +63,7 @@ def check_track(track: int, nodes: Arrays, spare: int) -> None:
     With `spare` 1 the track also needs the number of a further node.
     """
     info, all_ns, numbers, labels, backs, points, blocks, rows = nodes
-    size, n = len(labels), points.shape[2]
+    size, n = len(labels), points.shape[1]
     check(0 <= track < len(info))
     check(
         len(all_ns) == len(info)

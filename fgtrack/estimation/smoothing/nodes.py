@@ -19,7 +19,6 @@ from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.smoothing import insertion_kernels, linearisation_kernels
 from fgtrack.estimation.smoothing.node_arrays import (
     AHEAD_S,
-    CHANGED,
     COUNT,
     FILTERED,
     FIRST,
@@ -30,11 +29,9 @@ from fgtrack.estimation.smoothing.node_arrays import (
     NUM_PLUGINS,
     NUM_ROWS,
     NUM_VALUES,
-    ORIGIN,
     PLUGIN,
     POSE,
     PREDICTED,
-    REFERENCE,
     ROOT,
     ROWS_STALE,
     STALE,
@@ -93,16 +90,15 @@ class Nodes(Stateful):
         number there.
         """
         self._num_numbers = 0  # numbers that rows have taken
-        self.labels: IntArray = np.zeros((size, 5), dtype=np.int64)
-        """Columns: number of `rows` in use; 1 if a linearisation is newer than the factor graph; 1 if the
-        motion to the next node must be linearised; 1 if the measurements must be linearised; number of
-        measurements that a plug-in models.
+        self.labels: IntArray = np.zeros((size, 4), dtype=np.int64)
+        """Columns: number of `rows` in use; 1 if the motion to the next node must be linearised; 1 if the
+        measurements must be linearised; number of measurements that a plug-in models.
         """
         self.backs = np.zeros((size, n + 1, n + 1))
         """[A | b], the node given the next node: x - x0 = A (next - its x0) + b + N(0, C). The last row is the
         step: the smoothed mean minus the linearisation point x0.
         """
-        self.points, self.blocks = np.zeros((size, 2, n)), np.zeros((size, 6, n, n + 1))
+        self.points, self.blocks = np.zeros((size, n)), np.zeros((size, 7, n, n + 1))
         """See `node_arrays` and `_share`. A vector stands as the last column beside a matrix."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
@@ -154,11 +150,8 @@ class Nodes(Stateful):
             self.tracks[:, FIRST],
             self.backs[:, n, :n],
         )
-        self.origin, self.reference = (
-            self.points[:, ORIGIN],
-            self.points[:, REFERENCE],
-        )
-        """Linearisation point x0, and first x0, to which the variables of a factor graph are relative."""
+        self.origin = self.points
+        """Linearisation points x0."""
         self.filtered, self.predicted = (
             self.blocks[:, FILTERED],
             self.blocks[:, PREDICTED],
@@ -362,7 +355,7 @@ class Nodes(Stateful):
         ]
         if rows:
             self.rows[number, : self.labels[number, NUM_ROWS]] = np.concatenate(rows)
-        self.labels[number, CHANGED], self.labels[number, ROWS_STALE] = 1, 0
+        self.labels[number, ROWS_STALE] = 0
 
     def linearise(self, tracks: IntArray, starts: IntArray) -> None:
         """Linearise measurements and motion of the stale nodes of `tracks`, from the node before `starts` on."""
@@ -395,7 +388,6 @@ class Nodes(Stateful):
         self.ahead[stale], self.F[stale], self.Q[stale] = self.transition(
             self.origin[stale], dt_s
         )
-        self.labels[stale, CHANGED] = 1
 
     def transition(
         self, x: FloatArray, dt_s: FloatArray

@@ -19,7 +19,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     NONLINEAR,
     NUM_LEVELS,
     NUM_ROWS,
-    ORIGIN,
     PREDICTED,
     SEEN,
     SIZE,
@@ -49,7 +48,7 @@ def _shift(track: int, at: int, steps: FloatArray, nodes: Arrays) -> None:
     n, oldest = len(steps), info[track, FIRST]
     predicted = blocks[at, PREDICTED]
     for i in range(n):
-        points[at, ORIGIN, i] += steps[i]
+        points[at, i] += steps[i]
         backs[at, n, i] -= steps[i]
         predicted[i, n] -= steps[i]
     for k in range(labels[at, NUM_ROWS]):
@@ -122,7 +121,7 @@ def move_far(
     info, _, _, _, _, points, _, _ = nodes
     num = 0
     check_nodes(tracks, nodes, 0)
-    check(thresholds.shape[1] == points.shape[2] and len(thresholds) >= NUM_LEVELS)
+    check(thresholds.shape[1] == points.shape[1] and len(thresholds) >= NUM_LEVELS)
     check(len(far) > 0)
     check(len(starts) >= len(tracks))
     for t in range(len(tracks)):
@@ -140,7 +139,7 @@ def find_far(track: int, thresholds: FloatArray, nodes: Arrays, far: IntArray) -
     """Return the number of nodes of a window that are far from their linearisation points, and write their indices."""
     info, _, _, _, _, points, _, _ = nodes
     check_track(track, nodes, 0)
-    check(thresholds.shape[1] == points.shape[2] and len(thresholds) >= NUM_LEVELS)
+    check(thresholds.shape[1] == points.shape[1] and len(thresholds) >= NUM_LEVELS)
     check(0 <= info[track, NONLINEAR] < len(thresholds))
     return move_points(track, 0, NEVER, thresholds, nodes, False, far)
 
@@ -164,7 +163,7 @@ def _overshoots(
     _, _, _, labels, _, points, _, _ = nodes
     marks, values = seen[0][at], seen[1][at]
     out, L, n, row = space[0], space[4], len(mean), 0
-    origin, is_far = points[at, ORIGIN], False
+    origin, is_far = points[at], False
     while row < labels[at, NUM_ROWS]:
         k = marks[SIZE, row]
         last = marks[CODE, row + k - 1]
@@ -203,7 +202,7 @@ def overshot(
     `far` is scratch with an entry for each node of a track.
     """
     info, all_ns, numbers, _, backs, points, _, _ = nodes
-    n, num = points.shape[2], 0
+    n, num = points.shape[1], 0
     check_nodes(tracks, nodes, 0)
     check_seen(nodes, seen)
     check_noise(kind, noise, n)
@@ -220,7 +219,7 @@ def overshot(
         for k in range(num_far):
             at = numbers[tracks[t], far[k]]
             for i in range(n):
-                mean[i] = points[at, ORIGIN, i] + backs[at, n, i]
+                mean[i] = points[at, i] + backs[at, n, i]
             if _overshoots(kind, noise, at, mean, nodes, seen, space, linear):
                 out[t] = True
         num += out[t]

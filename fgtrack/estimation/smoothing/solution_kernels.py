@@ -33,7 +33,6 @@ from fgtrack.estimation.smoothing.node_arrays import (
     KNOWN,
     NODES,
     NUM_ROWS,
-    ORIGIN,
     PREDICTED,
     TIMES,
     VECTORS,
@@ -74,7 +73,7 @@ def _predict(
     copy(noise, ahead)
     add_congruence(motion, left, moved, ahead)
     for i in range(n):
-        ahead[i, n] = motion[i, n] - points[at, ORIGIN, i]
+        ahead[i, n] = motion[i, n] - points[at, i]
         for j in range(n):
             ahead[i, n] += motion[i, j] * left[j, n]
 
@@ -177,7 +176,7 @@ def solve_windows(
     Returns True if all states are finite.
     """
     info, _, numbers, labels, backs, points, blocks, rows = nodes
-    n = points.shape[2]
+    n = points.shape[1]
     check_nodes(tracks, nodes, 0)
     check_indices(anchors, tracks, nodes)
     check(len(starts) >= len(tracks))
@@ -228,7 +227,7 @@ def smooth(
     the mean of the node, or, where `after_s` > 0, the mean of the node before, given the node.
     """
     info, _, numbers, _, backs, points, blocks, _ = nodes
-    n = points.shape[2]
+    n = points.shape[1]
     check_nodes(tracks, nodes, 0)
     check_indices(indices, tracks, nodes)
     check(min(len(after_s), len(means)) >= len(tracks) and means.shape[1] == n)
@@ -254,4 +253,4 @@ def smooth(
             start = numbers[track, indices[t] - 1]
             mean_given(backs[start], backs[at], means[t])
         for i in range(n):
-            means[t, i] += points[start, ORIGIN, i]
+            means[t, i] += points[start, i]

@@ -87,8 +87,11 @@ class Solver(Stateful):
     def forget(self, track: int) -> None:
         """Drop the results for a window whose prior, or whole content, has changed."""
 
-    def _solve_graphs(self, tracks: IntArray, firsts: IntArray) -> None:
-        """Solve the factor graphs of windows that `_solve` has solved. The windows began at `firsts` before.
+    def _solve_graphs(
+        self, tracks: IntArray, starts: IntArray, firsts: IntArray
+    ) -> None:
+        """Solve the factor graphs of windows that `_solve` has solved from `starts` on. The windows began at `firsts`
+        before.
 
         Raises `numpy.linalg.LinAlgError` if a state is not finite.
         """
@@ -100,7 +103,7 @@ class Solver(Stateful):
         """
         firsts = self.nodes.first[tracks]
         self._solve(tracks, starts, anchors)
-        self._solve_graphs(tracks, firsts)
+        self._solve_graphs(tracks, starts, firsts)
 
     def _solve(
         self,
@@ -307,7 +310,7 @@ class Solver(Stateful):
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is farther than a threshold from its linearisation point."""
         nodes, far = self.nodes, np.empty(1, dtype=np.int64)
-        moved = tracks[:0]
+        begins = np.full(len(self.nodes.tracks), NEVER)  # of all tracks
         for _ in range(max_iterations if len(tracks) else 0):
             starts = np.empty(len(tracks), dtype=np.int64)
             num = relinearisation_kernels.move_far(
@@ -318,11 +321,12 @@ class Solver(Stateful):
             if num < len(tracks):
                 has_moved = starts < NEVER
                 tracks, starts = tracks[has_moved], starts[has_moved]
-            moved = moved if len(moved) else tracks
+            begins[tracks] = np.minimum(begins[tracks], starts)
             nodes.linearise(tracks, starts)
             self._solve(tracks, starts, nodes.first[tracks])
+        moved = (begins < NEVER).nonzero()[0]
         if len(moved):
-            self._solve_graphs(moved, nodes.first[moved])
+            self._solve_graphs(moved, begins[moved], nodes.first[moved])
 
     def reweight(self, tracks: IntArray) -> None:
         """Take further steps for tracks with a robust loss, whose weights follow the states."""
@@ -382,7 +386,7 @@ class Solver(Stateful):
             ):
                 share *= 0.5
             means, last = means + share * steps, longest
-        self._solve_graphs(tracks, first)
+        self._solve_graphs(tracks, first, first)
 
     def _cost(self, track: int, means: FloatArray) -> float:
         """Return half of the sum of squares of a window at `means` (m, n), with the robust losses of the

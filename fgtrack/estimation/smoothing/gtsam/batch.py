@@ -70,7 +70,9 @@ class BatchSolver(Solver):
         self._graphs.pop(track, None)
         self._read.clear()
 
-    def _solve_graphs(self, tracks: IntArray, firsts: IntArray) -> None:
+    def _solve_graphs(
+        self, tracks: IntArray, starts: IntArray, firsts: IntArray
+    ) -> None:
         """See `Solver._solve_graphs`. Means and covariances then come from the graphs."""
         nodes = self.nodes
         self._read.clear()
