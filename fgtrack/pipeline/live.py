@@ -566,8 +566,8 @@ class Tracker:
     def load(cls, path: str | Path) -> Self:
         """Return a tracker with the configuration and state of a file that `save` wrote, also in a new process.
 
-        The next ticks are those of the saved tracker, bit for bit; of `smoother` up to 1e-9 standard deviations. The
-        map is read again. Raises `DataError` for a file that is not a saved tracker of this version.
+        The next ticks are those of the saved tracker, bit for bit. The map is read again. Raises
+        `DataError` for a file that is not a saved tracker of this version.
         """
         check_paths(path=path)
         try:

@@ -9,8 +9,7 @@ from fgtrack.core.state import Snapshot
 class TrackerState:
     """All that changes in a tracker, as arrays and plain values; see `fgtrack.core.state`.
 
-    A tracker of the same configuration goes on from it with the same bits. `smoother` alone solves its windows again,
-    see `IncrementalSolver.restore`.
+    A tracker of the same configuration goes on from it with the same bits.
     """
 
     tracks: Snapshot

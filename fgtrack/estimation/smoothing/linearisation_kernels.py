@@ -201,9 +201,7 @@ def linearise(
             if labels[at, STALE] and index < info[track, COUNT] - 1:
                 dt_s = (all_ns[track, index + 1] - all_ns[track, index]) / NS_PER_S
                 motion = blocks[at, F]
-                transition(
-                    kind, points[at], dt_s, noise, mean, motion, blocks[at, Q]
-                )
+                transition(kind, points[at], dt_s, noise, mean, motion, blocks[at, Q])
                 for i in range(n):
                     motion[i, n] = mean[i]
             labels[at, STALE] = 0

@@ -90,9 +90,10 @@ class Nodes(Stateful):
         number there.
         """
         self._num_numbers = 0  # numbers that rows have taken
-        self.labels: IntArray = np.zeros((size, 4), dtype=np.int64)
-        """Columns: number of `rows` in use; 1 if the motion to the next node must be linearised; 1 if the
-        measurements must be linearised; number of measurements that a plug-in models.
+        self.labels: IntArray = np.zeros((size, 5), dtype=np.int64)
+        """Columns: number of `rows` in use; 1 if the `INFORMATION` is up to date; 1 if the motion to the next
+        node must be linearised; 1 if the measurements must be linearised; number of measurements that a plug-in
+        models.
         """
         self.backs = np.zeros((size, n + 1, n + 1))
         """[A | b], the node given the next node: x - x0 = A (next - its x0) + b + N(0, C). The last row is the
@@ -150,7 +151,7 @@ class Nodes(Stateful):
             self.tracks[:, FIRST],
             self.backs[:, n, :n],
         )
-        self.origin = self.points
+        self.origin = self.points[:]
         """Linearisation points x0."""
         self.filtered, self.predicted = (
             self.blocks[:, FILTERED],

@@ -21,6 +21,7 @@ from fgtrack.estimation.smoothing import (
 from fgtrack.estimation.smoothing.insertion_kernels import BEHIND, NO_ROOM, NOT_DEFINITE
 from fgtrack.estimation.smoothing.node_arrays import (
     BEGIN_NS,
+    INFORMED,
     NEVER,
     NONLINEAR,
     ROWS_STALE,
@@ -354,6 +355,7 @@ class Solver(Stateful):
         first = nodes.first[tracks]
         starts = np.minimum(first, start)
         numbers = nodes.numbers[track, starts[0] : nodes.count[track]].copy()
+        nodes.labels[numbers, INFORMED] = 0
         if means is not None:
             nodes.predicted[numbers[0], :, -1] -= means[0] - nodes.origin[numbers[0]]
             nodes.origin[numbers] = means
