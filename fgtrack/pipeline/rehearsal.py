@@ -8,6 +8,7 @@ import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,8 @@ _BIRTH, _NUM_FIRST = 2, 3
 _MOST_LISTS = 16
 #: Distances of the objects ahead of the ego; the near ones are between two tracks for a detection, or merged.
 _AHEAD_M = (8.0, 10.5, 18.0, 26.0, 27.5, 40.0)
+#: Modules that a tick needs only in a rare case, for example the assignment of many objects side by side.
+_RARE_MODULES = ("scipy.sparse", "scipy.sparse.csgraph", "scipy.special")
 _rehearsed = set[int]()
 
 
@@ -46,6 +49,8 @@ def rehearse(config: Config) -> None:
         return
     _LOG.info("loading and compiling what a tick needs")
     inverse_root(np.eye(1))  # LAPACK, which some estimators need in rare ticks only
+    for name in _RARE_MODULES:
+        import_module(name)
     tracker = build_tracker(config)
     for tick in clock_ticks(_messages(config), config.clock.node_hz):
         for message in tick.messages:

@@ -23,7 +23,7 @@ COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 NUM_LEVELS = 3
 #: Columns of `labels`.
 NUM_ROWS, INFORMED, STALE, ROWS_STALE, NUM_PLUGINS = range(5)
-#: `blocks` of a node. `INFORMATION` [R | d] is what a factor graph knows of the node from all older factors, with
+#: `blocks` of a node. `INFORMATION` [R | d] is the factor that elimination of the older nodes leaves on the node, with
 #: R (x - x0) = d + N(0, I); it is up to date if the node is `INFORMED`.
 C, FILTERED, PREDICTED, P, F, Q, INFORMATION = range(7)
 #: Rows of `marks`, rows of `values`, and the number of rows of `values`.
