@@ -117,7 +117,7 @@ def test_a_sensor_that_stops_degrades_and_all_that_stop_are_stale() -> None:
     assert health.state is HealthState.DEGRADED
     assert health.reasons[0].startswith("lidar: silent for 1.6")
     drive(tracker, 80, end_ns + 80 * 20 * MS, lambda each: None)
-    health = tracker.health()
+    health = tracker.health(HealthLimits(missed_share=1.0))
     assert health.state is HealthState.STALE
     assert health.reasons[0].startswith("sensors: no sensor")
     drive(tracker, 100, end_ns + 160 * 20 * MS)

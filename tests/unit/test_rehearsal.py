@@ -166,7 +166,7 @@ def test_making_a_tracker_imports_what_the_rare_functions_of_tracking_import(
     assert "scipy.sparse.csgraph" in names
     monkeypatch.setattr(rehearsal, "_rehearsed", set())
     with noted_imports(monkeypatch) as made:
-        Tracker(estimator="ekf-replay", set=SETTINGS["counting"])
+        Tracker("karle2023", map="oval", pit_map="oval")
     assert names - made == set()
 
 
