@@ -1,7 +1,7 @@
 """A tracker whose estimators follow decisions about all lists inside the horizon."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import ClassVar, NamedTuple, cast
 
@@ -73,6 +73,7 @@ class DecidedTracker(MultiObjectTracker):
         "decisions",
         "_public",
         "_roots",
+        "_shown",
         "_next_rebuilt",
         "_revisions",
         "_final",
@@ -95,6 +96,8 @@ class DecidedTracker(MultiObjectTracker):
         """Public number of each root."""
         self._roots: dict[int, int] = {}
         """Root of each public number."""
+        self._shown = set[int]()
+        """Public numbers of tracks that were confirmed at some time."""
         self._next_rebuilt = _FIRST_REBUILT
         self._of: dict[int, list[int | None]] = {}
         """Published track of each candidate, by the number of its list; None without a track."""
@@ -279,16 +282,16 @@ class DecidedTracker(MultiObjectTracker):
     ) -> None:
         """Let the estimators follow the decisions, and record the detections of the newly received list `entry`."""
         again: set[int] = set()
-        named = self._named(changes, again)
+        self._name_unknown(changes, again)
+        changes = [*changes, *self._inherit(changes, again)]
+        named = [list(map(self._numbered, each.taken)) for each in changes]
         self._revise(entry, changes, named, again, replaced)
         self._update_lives()
         if entry is not None:
             self._record(entry)
 
-    def _named(
-        self, changes: Sequence[Explained], again: set[int]
-    ) -> list[list[int | None]]:
-        """Return the public track of each candidate of the changed lists. New tracks get numbers.
+    def _name_unknown(self, changes: Sequence[Explained], again: set[int]) -> None:
+        """Give the numbers of tracks that vanish to new tracks with most of their detections.
 
         A track with another first detection than before keeps its number, and is added to `again`.
         """
@@ -304,23 +307,78 @@ class DecidedTracker(MultiObjectTracker):
             for root, votes in unknown.items():
                 for public, _ in votes.most_common():
                     if self._roots.get(public) not in present:
-                        self._public.pop(self._roots.get(public, NONE), None)
-                        self._public[root], self._roots[public] = public, root
+                        self._rename(root, public)
                         again.add(public)
                         break
-        named: list[list[int | None]] = []
+
+    def _inherit(
+        self, changes: Sequence[Explained], again: set[int]
+    ) -> list[Explained]:
+        """Exchange the numbers of tracks if most detections of a published track now belong to an unpublished one.
+
+        Both tracks are added to `again`. Return the other lists with detections of these tracks.
+        """
+        won: dict[int, Counter[int]] = {}
         for each in changes:
-            own: list[int | None] = []
-            for root in each.taken:
-                if root == NONE:
-                    own.append(None)
-                    continue
-                if root not in self._public:
-                    public = self._tracks.next_number()
-                    self._public[root], self._roots[public] = public, root
-                own.append(self._public[root])
-            named.append(own)
-        return named
+            for root, old in zip(each.taken, self._of[each.entry.number], strict=True):
+                if old is not None and self._public.get(root, old) != old:
+                    won.setdefault(root, Counter())[old] += 1
+        former: dict[int, int] = {}
+        for root, votes in won.items():
+            own, (public, count) = self._public[root], votes.most_common(1)[0]
+            rival = self._roots[public]
+            if (
+                public in self._shown
+                and own not in self._shown
+                and former.keys().isdisjoint((own, public))
+                and self._is_inside(root)
+                and self._is_inside(rival)
+                and count > self._num_detections(rival, changes)
+            ):
+                former[own], former[public] = root, rival
+                self._public[root], self._public[rival] = public, own
+                self._roots[public], self._roots[own] = root, rival
+                again.update((own, public))
+        if not former:
+            return []
+        changed = {id(each.entry) for each in changes}
+        return [
+            Explained(each, tuple([self._root(old, former) for old in publics]))
+            for each in self.decisions.entries
+            if id(each) not in changed
+            for publics in [self._of[each.number]]
+            if not former.keys().isdisjoint(publics)
+        ]
+
+    def _num_detections(self, root: int, changes: Sequence[Explained]) -> int:
+        """Return the number of detections of a track after `changes`, inside the horizon."""
+        changed = {id(each.entry) for each in changes}
+        kept = sum(
+            self._of[each.number].count(self._public[root])
+            for each in self.decisions.entries
+            if id(each) not in changed
+        )
+        return kept + sum(each.taken.count(root) for each in changes)
+
+    def _root(self, public: int | None, former: Mapping[int, int]) -> int:
+        """Return the root of a public track; `former` has the roots of tracks with a new number."""
+        if public is None:
+            return NONE
+        return former[public] if public in former else self._roots[public]
+
+    def _rename(self, root: int, public: int) -> None:
+        """Give a root the number of another one."""
+        self._public.pop(self._roots.get(public, NONE), None)
+        self._public[root], self._roots[public] = public, root
+
+    def _numbered(self, root: int) -> int | None:
+        """Return the public number of a root, a new one for a new root; None without a track."""
+        if root == NONE:
+            return None
+        if root not in self._public:
+            public = self._tracks.next_number()
+            self._public[root], self._roots[public] = public, root
+        return self._public[root]
 
     def _present_roots(self, changes: Sequence[Explained]) -> set[int]:
         """Return the roots of all tracks in the decisions as they are now."""
@@ -713,6 +771,8 @@ class DecidedTracker(MultiObjectTracker):
             if held is None:
                 continue
             living.add(held)
+            if is_confirmed:
+                self._shown.add(public)
             doubt = None
             least = self._lives.doubt_probability
             if is_confirmed and probability < least:
@@ -743,6 +803,10 @@ class DecidedTracker(MultiObjectTracker):
     def _began_inside(self, bank_id: int) -> bool:
         """True for a track whose first detection is not decided for good."""
         root = self._roots.get(self._tracks.public(bank_id))
+        return root is not None and self._is_inside(root)
+
+    def _is_inside(self, root: int) -> bool:
+        """True for a root that is not decided for good."""
         return any(root in entry.roots for entry in self.decisions.entries)
 
     def _record(self, entry: Entry) -> None:

@@ -1,10 +1,18 @@
-"""Status of tracks whose decisions late data may change."""
+"""Status and numbers of tracks whose decisions late data may change."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fgtrack import Config, Detection, DetectionList, TrackReport
+from fgtrack import (
+    Config,
+    Detection,
+    DetectionList,
+    TrackReport,
+    TruthState,
+    replay,
+    simulate,
+)
 from fgtrack.pipeline.build import build_tracker
 
 MS = 1_000_000
@@ -75,3 +83,26 @@ def test_a_car_that_the_last_list_misses_coasts() -> None:
     found = published({"lidar": {"std": {"x_m": 0.3, "y_m": 0.3}}}, lists)
     assert [each.status for each in found[-1]] == ["coasting"]
     assert [each.status for each in found[-2]] == ["confirmed"]
+
+
+def test_a_confirmed_car_keeps_its_number_when_a_track_of_a_late_list_takes_over_its_detections() -> (
+    None
+):
+    config = Config.from_yaml("open_space").replace(
+        {
+            "estimator": "ekf-replay",
+            "association": {"kind": "hypotheses"},
+            "lifecycle": {"kind": "existence"},
+        }
+    )
+    messages = list(simulate("drawn_ctrv", seed=5, duration_s=1.0))
+    run = replay(messages, config)
+    cars = {
+        each.object_id
+        for each in messages
+        if isinstance(each, TruthState) and each.object_id >= 0
+    }
+    tracks = run.tables["tracks"]
+    numbers = set(tracks["track_id"][tracks["status"] != "tentative"].tolist())
+    assert run.tables["revisions"].num_rows, "no decision changes here"
+    assert len(numbers) == len(cars)
