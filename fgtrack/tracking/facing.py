@@ -398,11 +398,18 @@ class Facing(Stateful):
         if not has_yaw:
             return []
         self._shares.pop(sensor, None)
-        counts = self.counts.setdefault(sensor, Counter())
-        counts["yaws"] += len(rows)
         words = [(k, _WORDS[defects[k]]) for k in defects.nonzero()[0].tolist()]
-        counts.update([word for _, word in words])
+        if self._is_new(sensor, stamp_ns, candidates, evidence):
+            counts = self.counts.setdefault(sensor, Counter())
+            counts["yaws"] += len(rows)
+            counts.update([word for _, word in words])
         return words
+
+    def _is_new(
+        self, sensor: str, stamp_ns: int, candidates: IntArray, evidence: FloatArray
+    ) -> bool:
+        """True if a yaw of the `candidates` (m,), with this `evidence` (m, 3), was not counted before."""
+        return True
 
     def published(
         self, track_ids: tuple[int, ...], states: Sequence[TrackState]

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, IntArray, YawWord
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.tracking.facing import MEMORY, Facing, shares_of
 
 _stamp = itemgetter(0)
@@ -80,29 +80,14 @@ class StampedFacing(Facing):
         row = bisect_left(history, self._stamp_ns - self._horizon_ns, key=_stamp)
         return shares_of(history[row - 1][1] if row else np.zeros(3))
 
-    def _learn(
-        self,
-        sensor: str,
-        stamp_ns: int,
-        rows: IntArray,
-        codes: IntArray,
-        evidence: FloatArray,
-        has_yaw: bool,
-        candidates: IntArray,
-    ) -> list[tuple[int, YawWord]]:
-        """See `Facing._learn`. A yaw that is read several times is counted once."""
-        before = {name: own.copy() for name, own in self.counts.items()}
-        words = super()._learn(
-            sensor, stamp_ns, rows, codes, evidence, has_yaw, candidates
-        )
-        if not has_yaw:
-            return words
+    def _is_new(
+        self, sensor: str, stamp_ns: int, candidates: IntArray, evidence: FloatArray
+    ) -> bool:
+        """See `Facing._is_new`. A yaw that is read once more is counted once."""
         noted = self._noted.setdefault((sensor, stamp_ns), {})
-        is_known = noted.keys() >= set(candidates.tolist())
-        if is_known and sensor in before:
-            self.counts[sensor] = before[sensor]
+        is_new = not noted.keys() >= set(candidates.tolist())
         for position, (_, flipped, other) in zip(
             candidates.tolist(), evidence.tolist(), strict=True
         ):
             noted[position] = flipped, other
-        return words
+        return is_new
