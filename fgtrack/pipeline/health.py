@@ -86,6 +86,11 @@ class SensorHealth:
     """Share of the newest 1,000 messages whose delay is above a limit, by the key of the limit."""
     silent_s: float
     """See `Lateness.silent_s`."""
+    horizon_s: float
+    """Time for which lists of the sensor may still be missing: its longest usual delay, at most the window.
+
+    A decision that is older changes seldom. `late_shares` has the share of the messages beyond the window.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +251,8 @@ class Source:
     silent_s: float
     usual_gap_s: float
     """Usual time between two messages; 0 if unknown."""
+    horizon_s: float
+    """See `SensorHealth.horizon_s`."""
 
 
 def sensor_health(
@@ -291,6 +298,7 @@ def sensor_health(
         failed_share,
         late,
         source.silent_s,
+        source.horizon_s,
     )
 
 

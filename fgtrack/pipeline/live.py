@@ -24,7 +24,7 @@ from fgtrack.core.state import (
     put_back,
     to_bytes,
 )
-from fgtrack.core.time import NS_PER_S, period_ns, seconds
+from fgtrack.core.time import NS_PER_S, nanoseconds, period_ns, seconds
 from fgtrack.core.types import (
     DetectionList,
     Disposition,
@@ -296,6 +296,7 @@ class Tracker:
         `limits` are the thresholds; None stands for the defaults.
         """
         limits = limits or HealthLimits()
+        reach_ns = nanoseconds(self.config.effective.reach_s)
         with self._turn:
             sources = {
                 name: Source(
@@ -305,6 +306,7 @@ class Tracker:
                     ],
                     lateness.silent_s,
                     self._watch.usual_gap_s(name),
+                    self._horizon_s(name, reach_ns),
                 )
                 for name, lateness in self.lateness.items()
             }
@@ -323,6 +325,11 @@ class Tracker:
             stale = self._stale(silent)
             late_ticks = list(self._late_ticks(limits))
             return overall(by_name, stale, late_ticks, self._watch.revised())
+
+    def _horizon_s(self, name: str, most_ns: int) -> float:
+        """Return the longest usual delay of a sensor, at most `most_ns`; 0 before its first message."""
+        delays = self._tracker.delays[name]
+        return seconds(max(delays.usual_ns(most_ns), 0)) if delays.messages else 0.0
 
     def _stale(self, silent: Collection[str]) -> list[str]:
         """Return the reasons for which tracks are predictions alone; `silent` sources send nothing."""

@@ -3,6 +3,7 @@
 import copy
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,26 @@ def test_a_consistent_tracker_is_ok_and_its_nis_is_near_one() -> None:
         assert nis.limits[0] < nis.mean_per_component < nis.limits[1]
         assert health.sensors[name].late_shares["lifecycle.out_of_view_s"] == 0.0
     assert health.sensors["ego"].nis is None
+
+
+def test_the_horizon_of_a_sensor_is_its_usual_delay_up_to_the_window() -> None:
+    tracker = made()
+    window_s = tracker.config.effective.reach_s
+
+    def late(message: DetectionList) -> DetectionList:
+        late_ns = round((window_s + 1.0) * 1e9)
+        stamp_ns = message.stamp_ns - (late_ns if message.sensor == "radar" else 0)
+        return replace(message, stamp_ns=stamp_ns)
+
+    assert tracker.health().sensors["lidar"].horizon_s == 0.0
+    drive(tracker, 40)
+    found = tracker.health().sensors
+    assert [found[name].horizon_s for name in SENSORS] == pytest.approx([0.04, 0.04])
+    drive(tracker, 300, START_NS + 800 * MS, late)
+    found = tracker.health().sensors
+    assert found["lidar"].horizon_s == pytest.approx(0.04)
+    assert found["radar"].horizon_s <= window_s
+    assert found["radar"].late_shares[tracker.config.effective.lag_key] > 0.8
 
 
 def test_a_tracker_without_a_tick_is_stale() -> None:
