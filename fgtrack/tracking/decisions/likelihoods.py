@@ -66,7 +66,7 @@ def likelihoods(
         densities,
         jumps,
         log_free,
-        nodes.existed * nodes.alive,
+        nodes.existed * nodes.alive * nodes.own,
         detectable,
         in_view,
         shows_misses,

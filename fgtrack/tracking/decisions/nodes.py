@@ -1,6 +1,7 @@
 """Tracks of hypotheses, hypotheses, and the steps after each list."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -165,6 +166,8 @@ class Step:
     hypotheses: tuple[Hypothesis, ...]
     unseen: tuple[Unseen, ...] = ()
     """Objects that no list has shown."""
+    apart: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    """Evidence that two tracks are two objects; see `fgtrack.tracking.decisions.second_returns`."""
 
 
 def first_step(motion: MotionModel, num_sensors: int, stamp_ns: int) -> Step:

@@ -11,6 +11,9 @@ from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.nodes import Nodes
 from fgtrack.tracking.lives.existence import densities
 
+Evidence = Mapping[tuple[int, int], float]
+"""Greatest log-likelihood ratio so far of two objects to a hull and its second return, by the roots of both tracks."""
+
 _HULL_STD_MPS = 0.5
 """Standard deviation of the velocity between both ends of a hull that turns."""
 
@@ -51,9 +54,9 @@ def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray | N
     own = entry.sensor.second_returns
     if own is None or not len(rows) or not entry.placed.any():
         return None
-    detected = (nodes.existed * nodes.alive * nodes.visible[:, entry.index])[
-        rows
-    ] * entry.sensor.detection_probability
+    exists = nodes.existed * nodes.alive * nodes.own
+    detectable = entry.sensor.detection_probability * nodes.visible[:, entry.index]
+    detected = (exists * detectable)[rows]
     y_m = entry.candidates.lines[:, None, :2] - nodes.means[None, rows, :2]
     P = nodes.covariances[rows][:, :2, :2] + _spreads_m2(nodes, rows, own.stds_m)
     m, t = y_m.shape[:2]
@@ -64,23 +67,26 @@ def second_returns(entry: Entry, nodes: Nodes, rows: IntArray) -> FloatArray | N
 
 
 def own_probabilities(
-    nodes: Nodes, rows: IntArray, returns: Mapping[int, Returns], speed_std_mps: float
-) -> FloatArray:
-    """Return the probability that each track is an object of its own, shape (n,), and no second return of a track in
-    `rows`.
+    nodes: Nodes,
+    rows: IntArray,
+    returns: Mapping[int, Returns],
+    speed_std_mps: float,
+    before: Evidence,
+) -> tuple[FloatArray, Evidence]:
+    """Return the probability that each track is an object of its own, shape (n,), and the evidence after this list.
 
-    The second return moves with the hull: the distance of both tracks is normal with the standard deviations
-    of the sensor's second returns, and their velocities are nearly equal. Another object is anywhere, and has a
-    velocity of its own. A track may be a second return of a track with more detections, or with as many and
-    a greater row number, which is older.
+    Otherwise the track is a second return of a track in `rows`. The second return moves with the hull: the distance of
+    both tracks is normal with the standard deviations of the sensor's second returns, and their velocities are nearly
+    equal. Another object is anywhere, and has a velocity of its own. Objects that were apart once stay two objects, so
+    the greatest ratio counts. A track may be a second return of a track with more detections, or with as many and a
+    greater row number, which is older.
     """
-    own = np.ones(len(nodes.roots))
+    own = np.ones(len(nodes))
     if not returns or len(rows) < 2:
-        return own
-    position, velocity = slice(0, 2), slice(2, 4)
-    exists = nodes.existed * nodes.alive
-    speeds_m2ps2 = 2.0 * speed_std_mps**2 * np.eye(2)
-    slow_m2ps2 = _HULL_STD_MPS**2 * np.eye(2)
+        return own, before
+    roots = set(nodes.roots.tolist())
+    after = {pair: ratio for pair, ratio in before.items() if roots.issuperset(pair)}
+    best = set(rows.tolist())
     for k in range(len(own)):
         given = returns.get(int(nodes.sensors[k]))
         if given is None:
@@ -89,23 +95,42 @@ def own_probabilities(
         hosts = rows[_is_host(nodes, rows, k) & (distances_m < 6.0 * max(given.stds_m))]
         if not len(hosts):
             continue
-        x = nodes.means[hosts] - nodes.means[k]
-        P = nodes.covariances[hosts] + nodes.covariances[k]
-        size_m2 = _spreads_m2(nodes, hosts, given.stds_m)
-        log_return = (
-            np.log(given.share * exists[hosts])
-            + _log_normal(x[:, position], P[:, position, position] + size_m2)
-            + _log_normal(x[:, velocity], P[:, velocity, velocity] + slow_m2ps2)
-        )
-        log_object = given.log_new_per_m2 + _log_normal(
-            x[:, velocity], P[:, velocity, velocity] + speeds_m2ps2
-        )
-        log_object = log_object + given.log_seen(
-            int(nodes.counts[k]), int(nodes.misses[k])
-        )
-        odds = np.exp(np.clip(log_return - log_object, -50.0, 50.0)).sum()
+        ratios = _log_apart(nodes, hosts, k, given, speed_std_mps)
+        root = int(nodes.roots[k])
+        for j, host in enumerate(nodes.roots[hosts].tolist()):
+            pair = min(root, host), max(root, host)
+            ratios[j] = max(ratios[j], before.get(pair, -math.inf))
+            if k in best:
+                after[pair] = float(ratios[j])
+        seen = given.log_seen(int(nodes.counts[k]), int(nodes.misses[k]))
+        odds = np.exp(np.clip(-ratios - seen, -50.0, 50.0)).sum()
         own[k] = 1.0 / (1.0 + odds)
-    return own
+    return own, after
+
+
+def _log_apart(
+    nodes: Nodes, hosts: IntArray, k: int, given: Returns, speed_std_mps: float
+) -> FloatArray:
+    """Return the log-likelihood ratio of an object to a second return of each host, shape (t,).
+
+    The position and the velocity of track `k` count.
+    """
+    position, velocity = slice(0, 2), slice(2, 4)
+    x = nodes.means[hosts] - nodes.means[k]
+    P = nodes.covariances[hosts] + nodes.covariances[k]
+    exists = (nodes.existed * nodes.alive * nodes.own)[hosts]
+    size_m2 = _spreads_m2(nodes, hosts, given.stds_m)
+    slow_m2ps2 = _HULL_STD_MPS**2 * np.eye(2)
+    speeds_m2ps2 = 2.0 * speed_std_mps**2 * np.eye(2)
+    log_return = (
+        np.log(np.maximum(given.share * exists, 1e-300))
+        + _log_normal(x[:, position], P[:, position, position] + size_m2)
+        + _log_normal(x[:, velocity], P[:, velocity, velocity] + slow_m2ps2)
+    )
+    log_object = given.log_new_per_m2 + _log_normal(
+        x[:, velocity], P[:, velocity, velocity] + speeds_m2ps2
+    )
+    return np.asarray(log_object - log_return)
 
 
 def _spreads_m2(

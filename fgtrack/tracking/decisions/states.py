@@ -1,5 +1,6 @@
 """States and probabilities of the tracks of hypotheses: prediction, detections and misses, births."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -27,8 +28,9 @@ from fgtrack.tracking.decisions.likelihoods import Table
 from fgtrack.tracking.decisions.measurements import correct, renewed, split
 from fgtrack.tracking.decisions.nodes import Nodes
 from fgtrack.tracking.decisions.rules import Rules
-from fgtrack.tracking.decisions.second_returns import own_probabilities
+from fgtrack.tracking.decisions.second_returns import Evidence, own_probabilities
 from fgtrack.tracking.decisions.unseen import Unseen, first_state
+from fgtrack.tracking.lives.existence import densities
 
 _KALMAN = "fgtrack.estimation.kernels.kalman"
 _KERNELS = "fgtrack.tracking.decisions.step_kernels"
@@ -123,9 +125,25 @@ def updated(
         rules.visible_share,
         rules.min_travel_m,
     )
+    if rules.min_travel_m:
+        _note_movers(nodes, hits, rules)
     if descriptions is nodes.descriptions:
         return nodes
     return replace(nodes, descriptions=descriptions)
+
+
+def _note_movers(nodes: Nodes, hits: IntArray, rules: Rules) -> None:
+    """Note which of the tracks `hits` (h,) are objects that move: the probability is that of a confirmation.
+
+    As many objects stand as move. The odds that an object stands are the density of the velocity 0 after all
+    detections, over the density before them. Source: Dickey, "The weighted likelihood ratio, linear hypotheses on
+    normal location parameters", Annals of Mathematical Statistics 42(1), 1971.
+    """
+    v, P = nodes.means[hits, 2:4], nodes.covariances[hits, 2:4, 2:4]
+    before = 1.0 / (math.tau * rules.speed_std_mps**2)
+    odds = densities(np.ascontiguousarray(v), P, np.zeros(P.shape)) / before
+    moves = 1.0 / (1.0 + odds) >= rules.confirm_probability
+    nodes.numbers[hits[moves], HAS_TRAVELLED] = 1
 
 
 def _correct(
@@ -152,13 +170,18 @@ def _described(
     return tuple(descriptions)
 
 
-def judged(nodes: Nodes, rows: IntArray, entry: Entry, rules: Rules) -> Nodes:
-    """Return the tracks with their confirmation, and with the rate at which their existence decays from now on.
+def judged(
+    nodes: Nodes, rows: IntArray, entry: Entry, before: Evidence, rules: Rules
+) -> tuple[Nodes, Evidence]:
+    """Return the tracks with their confirmation, and with the rate at which their existence decays from now on; and
+    the evidence that tracks are two objects.
 
     `nodes` is a copy, which is overwritten. `rows` are the tracks of the best hypothesis, of which other tracks may be
     second returns.
     """
-    own = own_probabilities(nodes, rows, rules.returns, rules.speed_std_mps)
+    own, after = own_probabilities(
+        nodes, rows, rules.returns, rules.speed_std_mps, before
+    )
     kernels(_KERNELS).judge(
         nodes.probabilities,
         nodes.numbers,
@@ -170,4 +193,4 @@ def judged(nodes: Nodes, rows: IntArray, entry: Entry, rules: Rules) -> Nodes:
         rules.hidden_s,
         rules.out_of_view_s,
     )
-    return nodes
+    return nodes, after

@@ -49,8 +49,9 @@ def following(before: Step, entry: Entry, rules: Rules) -> Step:
     returns = second_returns(entry, nodes, before.hypotheses[0].rows)
     table = likelihoods(nodes, entry, views[:, entry.index], unseen, returns, rules)
     ranked = _ranked(before, table, rules.most)
-    result, hypotheses = _explained(nodes, entry, views, table, unseen, ranked, rules)
-    return Step(stamp_ns, entry, result, hypotheses, not_shown(entry, unseen))
+    every, hypotheses = _explained(nodes, entry, views, table, unseen, ranked, rules)
+    result, apart = judged(every, hypotheses[0].rows, entry, before.apart, rules)
+    return Step(stamp_ns, entry, result, hypotheses, not_shown(entry, unseen), apart)
 
 
 def _ranked(before: Step, table: Table, most: int) -> Ranked:
@@ -115,4 +116,4 @@ def _explained(
         ]
     )
     kept = every if len(in_use) == len(every) else every.at(in_use)
-    return judged(kept, hypotheses[0].rows, entry, rules), hypotheses
+    return kept, hypotheses
