@@ -87,9 +87,10 @@ def effect(before: RunQuality | None, after: RunQuality | None) -> str:
 def prediction_change(before: Run, after: Run) -> Estimate:
     """Return the relative change of the predicted innovations from `before` to `after`, with its 95 % interval.
 
-    Each innovation is a prediction: the detection is not used in it. Its components are
-    in standard deviations of the sensor in `before`. The change is that of their root
-    mean square, over the detections that both runs have fused.
+    An innovation tests a prediction, because the detection was not yet fused. Its
+    components are divided by the standard deviations of the sensor in `before`. The
+    result is the change of their root mean square over the detections that both runs
+    have fused.
     """
     first, second = _shared_rows(before, after)
     squares = np.stack(

@@ -196,8 +196,8 @@ def _displacements(
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (n,) and displacements (n, 2) of the detections in `tracks` from `paths` of the reference.
 
-    A detection is compared with each path, and the displacement counts if it is shorter than `_REACH_M`. The axes are
-    those of the ego, or of the map without an `ego`.
+    A detection is compared with each path, and the displacement counts if it is shorter than `_REACH_M`. It is
+    given along and left of the `ego`, or along the axes of the map if `ego` is None.
     """
     stamps: list[IntArray] = []
     offsets: list[FloatArray] = []

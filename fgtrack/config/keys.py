@@ -115,7 +115,7 @@ def _dataclasses(hint: Any, named: str = "") -> Iterator[tuple[type, str | None,
 
 
 def _summary(hint: Any) -> str:
-    """Return the first line about a value that has keys of its own."""
+    """Return the first line of the description of a section: a value that consists of further keys."""
     found = list(_dataclasses(hint))
     if len(found) > 1:
         return "Keys of each kind below."

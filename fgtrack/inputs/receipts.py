@@ -129,7 +129,7 @@ class _Sorter(Generic[_Item]):
 def sorted_out(
     items: Iterable[_Item], receipt_ns: Callable[[_Item], int | None]
 ) -> Iterator[tuple[_Item, bool]]:
-    """Yield each item with True if its receipt is more than an hour from those of the items before and behind it.
+    """Yield each item, with True if its receipt is wrong: more than an hour from the receipts before and after it.
 
     Only few items in succession are wrong, at most a tenth of their neighbours; longer
     pauses remain. Items without a receipt are right. The order stays, except that wrong

@@ -103,7 +103,7 @@ class Method(ABC):
                     raise MethodError(_not_causal(query.num_known, time_s))
 
     def check_causality_of_tracks(self, problem: CrowdProblem) -> None:
-        """Compare the tracks with those of the problem without its later scans. Raises as `check_causality`."""
+        """Compare the tracks with the tracks of a run without the later scans. Raises as `check_causality`."""
         asked, cuts = with_more_scan_queries(problem)
         found = self.tracks(asked).positions
         for num_known in cuts:

@@ -34,7 +34,7 @@ class CsvTable:
         self._write(text_header(table, is_scored))
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Append `rows`, whose columns are those of the table."""
+        """Append `rows`, each with a value for every column of the table."""
         self._write(text(self._table, rows).encode())
 
     def append_columns(self, columns: Columns) -> None:

@@ -180,12 +180,12 @@ class ListAssociation:
     def claimed_by_younger(
         self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt
     ) -> tuple[StatesAt, Assignment] | None:
-        """Return the states of the tracks that began after the stamp of `batch`, and the assignment of `new`
-        candidates to them.
+        """Return the states of the younger tracks, and the assignment of the `new` candidates to them.
 
-        None if there are no such tracks. Each of them was started by a newer detection that arrived earlier. A
-        candidate of the same object is too old for the track, and is no new object. The present states of these tracks
-        are moved back to the stamp and compared with the candidates. `states` are the states of the other tracks.
+        A younger track was started by a newer detection that arrived before `batch`. A candidate of its object is too
+        old for the track, and is no new object. So the present states of the younger tracks are moved back to the
+        stamp of `batch` and compared with the candidates. `states` are the states of the older tracks. Returns None
+        without younger tracks.
         """
         bank, motion = self._parts.bank, self._parts.motion
         now = bank.states_at(bank.present_ns)

@@ -137,7 +137,7 @@ class ListEntries(Stateful):
         return entry.scan.ego is None or entry.scan.ego.extrapolated_s != 0.0
 
     def settle(self, entry: Entry) -> None:
-        """Note a list that is decided for good."""
+        """Record that the decisions about a list are final."""
         if _is_extrapolated(entry) and places(entry.batch, entry.sensor):
             self._extrapolated_ns.append(entry.batch.stamp_ns)
             while entry.batch.stamp_ns - self._extrapolated_ns[0] > _KEPT_NS:

@@ -30,7 +30,7 @@ class StampedObjects(Objects):
         self._open.get(track_id, {}).pop(key, None)
 
     def settle(self, oldest_ns: int) -> None:
-        """Learn from the detections before `oldest_ns`, which are decided for good."""
+        """Learn classes, sizes and identities from the detections before `oldest_ns`, whose decisions are final."""
         for track_id, own in self._open.items():
             for key in sorted(each for each in own if each[0] < oldest_ns):
                 self.learn(track_id, own.pop(key))

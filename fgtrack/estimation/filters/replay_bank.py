@@ -129,7 +129,7 @@ class ReplayBank(Stateful):
     def _allocate(self, *least: int) -> None:
         """Make arrays for at least `least` tracks, steps and components, and copy the present contents.
 
-        The arrays are those of `fgtrack.estimation.kernels.replay_arrays`.
+        `fgtrack.estimation.kernels.replay_arrays` describes the arrays.
         """
         present, n = self._shape[0], self._motion.dim
         rows, slots, k = shape = tuple(map(max, self._shape, (*least, 0, 0)))

@@ -27,8 +27,8 @@ def outliers(times_s: FloatArray, behind_s: float = _BEHIND_S) -> BoolArray:
     """Return a mask of the wrong times among `times_s`, shape (n,); NaN stands for a missing time, which is not wrong.
 
     A time is wrong if it is more than a minute and five ranges after its neighbours, or more than `behind_s` and five
-    ranges before them. The range is that of the neighbours' times. Reports that a satellite delivers late are earlier
-    than their neighbours, but not by so much.
+    ranges before them. The range is the difference of the latest and the earliest time of the neighbours. Reports that
+    a satellite delivers late are earlier than their neighbours, but by less.
     """
     present = np.flatnonzero(~np.isnan(times_s))
     is_wrong = np.zeros(len(times_s), dtype=bool)

@@ -51,8 +51,8 @@ def decompressed(file: Path) -> Iterator[Path]:
 def files_of(path: Path) -> list[Path]:
     """Return the files of the recording at `path`.
 
-    They are the file itself, the files in the folder's metadata.yaml, or all bag files in the folder, if there is no
-    metadata.yaml or a file in it has another name now.
+    `path` is a file, or a folder. The files of a folder are named in its metadata.yaml. Without metadata.yaml, or if a
+    named file is missing, they are all bag files in the folder.
 
     Raises `DataError` if two files have the same content.
     """
