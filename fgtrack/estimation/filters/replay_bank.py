@@ -55,7 +55,6 @@ from fgtrack.estimation.object_bank import (
 )
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import MotionModel, WhiteNoise
-from fgtrack.models.robust import compiled_form
 
 #: Column of `labels` at which the codes of the components begin, see `kernels.replay_arrays`.
 CODES = 3
@@ -262,7 +261,7 @@ class ReplayBank(Stateful):
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
         """True if the window has an identical measurement of this track."""
-        return self._index_of(track_id, measurement) is not None
+        return self._index_of(track_id, measurement) > 0
 
     def withdraw(self, track_id: int, measurement: Measurement) -> bool:
         """Filter a track without a measurement, as if it had never been fused. Return False if the window does not
@@ -272,7 +271,7 @@ class ReplayBank(Stateful):
         longer be fused.
         """
         index, row = self._index_of(track_id, measurement), self._rows[track_id]
-        if not index or row in self._outside:
+        if index <= 0 or row in self._outside:
             return False
         model, rows = (self._kind, self._noise), np.array([row])
         if not kernels(KERNELS).withdraw(*model, self._arrays, rows, index):
@@ -280,24 +279,13 @@ class ReplayBank(Stateful):
             raise EstimatorError({track_id: cause}, {})
         return True
 
-    def _index_of(self, track_id: int, measurement: Measurement) -> int | None:
-        """Return the index of the step with an identical measurement; None without one."""
-        row, seen = self._rows[track_id], measurement.seen_by(self._motion)
-        order, labels, _, windows, measured, views = (
-            each[row] for each in self._arrays
-        )
-        k = len(seen.z)
-        loss, width = compiled_form(seen.loss, k)
-        label = [seen.stamp_ns, k, loss, *seen.model.codes.tolist()]
-        for index, slot in enumerate(order[: windows[0]].tolist()):
-            if (
-                labels[slot, : len(label)].tolist() == label
-                and (measured[slot, 0, :k] == seen.z).all()
-                and (measured[slot, 1 : k + 1, :k] == seen.R).all()
-                and views[slot].tolist() == [*seen.pose, width]
-            ):
-                return index
-        return None
+    def _index_of(self, track_id: int, measurement: Measurement) -> int:
+        """Return the index of the step with an identical measurement; -1 without one."""
+        seen = measurement.seen_by(self._motion)
+        one = replace(seen, z=seen.z[None], R=seen.R[None])
+        rows = np.array([self._rows[track_id]])
+        found = kernels(KERNELS).find(self._arrays, rows, seen.stamp_ns, stack_of(one))
+        return int(found)
 
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement

@@ -36,6 +36,7 @@ from fgtrack.estimation.kernels.replay_arrays import (
     check_bank,
     check_room,
     insert_step,
+    is_same,
     track_of,
 )
 from fgtrack.estimation.kernels.replay_steps import (
@@ -215,6 +216,23 @@ def withdraw(
         if not correct_slot(kind, track, slot, innovation, H, correction):
             return False
     return True
+
+
+@njit(f"int64({BANK}, int64[::1], int64, {STACK})")
+def find(bank: Bank, tracks: IntArray, stamp_ns: int, stack: Stack) -> int:
+    """Return the index of the step of the first of `tracks` with the first measurement of `stack`; -1 without one."""
+    check(len(tracks) > 0 and len(stack[0]) > 0)
+    n, k = bank[2].shape[3], len(stack[0])
+    check_bank(tracks, 0, bank, n)
+    check_stack(stack, 1, k, n)
+    if k >= bank[4].shape[2]:
+        return -1
+    check_room(bank, k)
+    track = track_of(bank, tracks[0])
+    for index in range(1, track[3][COUNT]):
+        if is_same(track, track[0][index], stamp_ns, stack, 0):
+            return index
+    return -1
 
 
 @njit(f"int64({BANK}, int64[::1], {TIMES_NS}, {STACK})")

@@ -144,6 +144,26 @@ def _write(track: Track, slot: int, stamp_ns: int, stack: Stack, row: int) -> No
             own[1 + a, b] = R[row, a, b]
 
 
+@inlined
+def is_same(track: Track, slot: int, stamp_ns: int, stack: Stack, row: int) -> bool:
+    """True if the step in a slot has the measurement in a row of `stack`."""
+    _, labels, _, _, measured, views = track
+    components, view, loss, z, R = stack
+    k, label, own = len(components), labels[slot], measured[slot]
+    if label[STAMP_NS] != stamp_ns or label[SIZE] != k or label[LOSS] != loss:
+        return False
+    for a in range(WIDTH + 1):
+        if views[slot, a] != view[a]:
+            return False
+    for a in range(k):
+        if label[CODES + a] != components[a] or own[0, a] != z[row, a]:
+            return False
+        for b in range(k):
+            if own[1 + a, b] != R[row, a, b]:
+                return False
+    return True
+
+
 @merged
 def insert_step(track: Track, times_ns: Times, stack: Stack, row: int) -> int:
     """Insert the measurement in a row of `stack` into the steps of a track. Return the index of the step.
