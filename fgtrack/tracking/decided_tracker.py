@@ -2,7 +2,9 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import ClassVar, NamedTuple, cast
 
 import numpy as np
@@ -13,7 +15,7 @@ from fgtrack.core.types import (
     Revision,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurement, Measurements, StatesAt
+from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.failures import Failure
 from fgtrack.tracking.association import Assignment, Pairs, quantiles, weighed
 from fgtrack.tracking.decisions.entries import Entry
@@ -470,20 +472,16 @@ class DecidedTracker(MultiObjectTracker):
             for public in again
             if self._is_unknown(public) or not self._began_before_horizon(public)
         }
-        stuck = set[tuple[int, int, int]]()
-        for place in lost:
-            if place.track not in anew and not self._withdraw(place):
-                stuck.add((*place.detection, place.track))
+        stuck = {
+            (*place.detection, place.track)
+            for place in self._withdraw(
+                [place for place in lost if place.track not in anew]
+            )
+        }
         anew.update(
             public for _, _, public in stuck if not self._began_before_horizon(public)
         )
-        again_read = []
-        for public, places in self._read_newer(anew, lost, won).items():
-            taken = [place for place in reversed(places) if self._withdraw(place)]
-            if len(taken) == len(places) or self._began_before_horizon(public):
-                again_read += taken
-            else:
-                anew.add(public)
+        again_read = self._withdraw_newer(self._read_newer(anew, lost, won), anew)
         chosen = [
             place
             for place in won
@@ -635,21 +633,57 @@ class DecidedTracker(MultiObjectTracker):
     def _leaves_no_trace(self, place: _Place) -> bool:
         """True for a candidate from which a track learns nothing but its state."""
         known = self._fused_as.get(place.key)
-        return known is not None and "yaw_rad" not in known[1].model.components
-
-    def _withdraw(self, place: _Place) -> bool:
-        """Undo the fusion of a candidate with its former track. Return False if the bank cannot undo it."""
-        known = self._fused_as.pop(place.key, None)
         if known is None:
-            return True
-        bank_id, stack, row = known
-        if self._objects is not None:
-            self._objects.take_back(bank_id, _key(place.entry, place.position))
-        if not self._parts.bank.withdraw(bank_id, Measurements(stack)[row]):
             return False
-        self._tracks.num_measured[bank_id] -= 1
-        self._lives.doubt(bank_id)
-        return True
+        measurement = known[1]
+        # A yaw of the map is no evidence of the front.
+        return "yaw_rad" not in {*measurement.model.components} - {*measurement.assumed}
+
+    def _withdraw_newer(
+        self, newer: Mapping[int, Sequence[_Place]], anew: set[int]
+    ) -> list[_Place]:
+        """Undo the fusion of newer candidates, by track, and return these candidates.
+
+        A track whose estimator cannot undo all of them is added to `anew`.
+        """
+        every = [place for places in newer.values() for place in places]
+        every.sort(key=lambda place: place.entry.key, reverse=True)
+        kept = self._withdraw(every)
+        stuck = {
+            place.track for place in kept if not self._began_before_horizon(place.track)
+        }
+        anew |= stuck
+        keys = {place.key for place in kept}
+        return [
+            place
+            for place in every
+            if place.track not in stuck and place.key not in keys
+        ]
+
+    def _withdraw(self, places: Sequence[_Place]) -> list[_Place]:
+        """Undo the fusion of candidates with their former tracks. Return the candidates that the bank still has."""
+        kept: list[_Place] = []
+        known = [
+            (place, *self._fused_as.pop(place.key))
+            for place in places
+            if place.key in self._fused_as
+        ]
+        for _, group in groupby(known, key=lambda each: id(each[2])):
+            given = list(group)
+            stack, rows = given[0][2], [row for *_, row in given]
+            track_ids = [bank_id for _, bank_id, _, _ in given]
+            own = replace(stack, z=stack.z[rows], R=stack.R[rows])
+            if self._objects is not None:
+                for place, bank_id, *_ in given:
+                    self._objects.take_back(bank_id, _key(place.entry, place.position))
+            undone = self._parts.bank.withdraw(track_ids, own)
+            for (place, bank_id, *_), is_undone in zip(given, undone, strict=True):
+                if not is_undone:
+                    kept.append(place)
+                    continue
+                self._tracks.num_measured[bank_id] -= 1
+                self._lives.doubt(bank_id)
+        return kept
 
     def _birth(self, place: _Place, is_again: bool) -> None:
         """Start the estimator of a track."""

@@ -14,6 +14,7 @@ from fgtrack.core.state import Snapshot, Stateful, stateful
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     Measurement,
+    Measurements,
     Start,
     StatesAt,
     TrackBank,
@@ -177,13 +178,31 @@ class GuardedBank(Stateful):
                     )
         return results
 
-    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
-        """Undo the fusion of a measurement. Return False if the estimator cannot, or does not have the measurement.
+    def withdraw(self, track_ids: Sequence[int], stack: Measurement) -> list[bool]:
+        """Undo the fusion of the measurements of `stack`, one of each track.
 
-        A track that raises ends.
+        Return False for a track whose estimator cannot, or does not have the measurement. A track that raises ends.
         """
         bank: Any = self._bank  # Any: not each bank has `withdraw`
-        if track_id not in self._alive or not hasattr(bank, "withdraw"):
+        if not hasattr(bank, "withdraw"):
+            return [False] * len(track_ids)
+        if hasattr(bank, "withdraw_stack") and self._alive.keys() >= set(track_ids):
+            outcomes = bank.withdraw_stack(track_ids, stack).tolist()
+            cause = np.linalg.LinAlgError("a measurement can no longer be fused")
+            pairs = zip(track_ids, outcomes, strict=True)
+            failed = {each: cause for each, outcome in pairs if outcome < 0}
+            if failed:
+                self._end(failed, Failure.UPDATE_FAILED)
+            return [outcome > 0 for outcome in outcomes]
+        return [
+            self._withdraw_one(each, own)
+            for each, own in zip(track_ids, Measurements(stack), strict=True)
+        ]
+
+    def _withdraw_one(self, track_id: int, measurement: Measurement) -> bool:
+        """See `withdraw`."""
+        bank: Any = self._bank
+        if track_id not in self._alive:
             return False
         try:
             return bool(bank.withdraw(track_id, measurement))

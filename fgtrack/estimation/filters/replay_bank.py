@@ -261,7 +261,13 @@ class ReplayBank(Stateful):
 
     def has_fused(self, track_id: int, measurement: Measurement) -> bool:
         """True if the window has an identical measurement of this track."""
-        return self._index_of(track_id, measurement) > 0
+        seen = measurement.seen_by(self._motion)
+        if len(seen.z) > self._shape[2]:
+            return False
+        one = replace(seen, z=seen.z[None], R=seen.R[None])
+        rows = np.array([self._rows[track_id]])
+        find = kernels(KERNELS).find
+        return bool(find(self._arrays, rows, seen.stamp_ns, stack_of(one)) > 0)
 
     def withdraw(self, track_id: int, measurement: Measurement) -> bool:
         """Filter a track without a measurement, as if it had never been fused. Return False if the window does not
@@ -270,22 +276,34 @@ class ReplayBank(Stateful):
         False also for a track that is replayed step by step. Raises `EstimatorError` if a later measurement can no
         longer be fused.
         """
-        index, row = self._index_of(track_id, measurement), self._rows[track_id]
-        if index <= 0 or row in self._outside:
-            return False
-        model, rows = (self._kind, self._noise), np.array([row])
-        if not kernels(KERNELS).withdraw(*model, self._arrays, rows, index):
+        one = replace(measurement, z=measurement.z[None], R=measurement.R[None])
+        outcome = int(self.withdraw_stack([track_id], one)[0])
+        if outcome < 0:
             cause = np.linalg.LinAlgError("a measurement can no longer be fused")
             raise EstimatorError({track_id: cause}, {})
-        return True
+        return outcome > 0
 
-    def _index_of(self, track_id: int, measurement: Measurement) -> int:
-        """Return the index of the step with an identical measurement; -1 without one."""
-        seen = measurement.seen_by(self._motion)
-        one = replace(seen, z=seen.z[None], R=seen.R[None])
-        rows = np.array([self._rows[track_id]])
-        found = kernels(KERNELS).find(self._arrays, rows, seen.stamp_ns, stack_of(one))
-        return int(found)
+    def withdraw_stack(self, track_ids: Sequence[int], stack: Measurement) -> IntArray:
+        """Filter each track without its measurement in `stack`, see `withdraw`.
+
+        Returns 1 for a track that had the measurement, 0 for another track, and -1 if a later measurement can no longer
+        be fused, shape (tracks,).
+        """
+        seen = stack.seen_by(self._motion)
+        outcomes = np.zeros(len(track_ids), dtype=np.int64)
+        rows = [self._rows[each] for each in track_ids]
+        rows = [-1 if row in self._outside else row for row in rows]
+        if seen.z.shape[1] <= self._shape[2]:
+            kernels(KERNELS).withdraw(
+                self._kind,
+                self._noise,
+                self._arrays,
+                np.array(rows),
+                seen.stamp_ns,
+                stack_of(seen),
+                outcomes,
+            )
+        return outcomes
 
     def _fused(
         self, stamp_ns: int, track_ids: Sequence[int], one: Measurement

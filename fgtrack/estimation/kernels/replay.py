@@ -11,6 +11,7 @@ from fgtrack.core.compiled import (
     check,
     check_rows,
     copy,
+    inlined,
     merged,
     njit,
     scratch,
@@ -185,37 +186,62 @@ def fuse(
     return num_without_room
 
 
-@njit(f"b1(int64, float64[::1], {BANK}, int64[::1], int64)")
-def withdraw(
-    kind: int, noise: FloatArray, bank: Bank, tracks: IntArray, index: int
-) -> bool:
-    """Take the step at `index` out of the first of `tracks`, and re-filter the later measurements without it.
+@inlined
+def _index_of(track: Track, stamp_ns: int, stack: Stack, row: int) -> int:
+    """Return the index of the step with the measurement in a row of `stack`; -1 without one."""
+    found = -1
+    for index in range(1, track[3][COUNT]):
+        if is_same(track, track[0][index], stamp_ns, stack, row):
+            found = index
+            break
+    return found
 
-    False if a later measurement can no longer be fused. The states from this later measurement on are then invalid.
+
+@njit(f"void(int64, float64[::1], {BANK}, int64[::1], int64, {STACK}, int64[::1])")
+def withdraw(
+    kind: int,
+    noise: FloatArray,
+    bank: Bank,
+    tracks: IntArray,
+    stamp_ns: int,
+    stack: Stack,
+    outcomes: IntArray,
+) -> None:
+    """Take the measurements of `stack` out of the steps of `tracks` (m,), and re-filter the later measurements.
+
+    Written is 1 for a track that had the measurement, 0 for a track without it or without a row, and -1 if a later
+    measurement can no longer be fused. The states from this later measurement on are then invalid.
     """
-    n = bank[2].shape[3]
+    n, k = bank[2].shape[3], len(stack[0])
     check_noise(kind, noise, n)
-    check_bank(tracks, 0, bank, n)
-    check(len(tracks) > 0)
-    track = track_of(bank, tracks[0])
-    slots, labels, steps, window, _, _ = track
-    count = window[COUNT]
-    check(0 < index < count)
+    check_bank(tracks, -1, bank, n)
+    check_stack(stack, len(tracks), k, n)
+    check_room(bank, k)
+    check(len(outcomes) >= len(tracks))
     space = replay_space(n, bank[4].shape[3])
     innovation, H, _, smoothing, correction = space
-    own = slots[index]
-    for later in range(index, count - 1):
-        slots[later] = slots[later + 1]
-    slots[count - 1] = own
-    window[COUNT] = count - 1
-    window[NEWEST_NS] = labels[slots[count - 2], STAMP_NS]
-    for j in range(index, count - 1):
-        slot = slots[j]
-        predict_at(kind, noise, track, j, smoothing[0])
-        innovate(kind, steps[slot, 0], track, slot, innovation, H)
-        if not correct_slot(kind, track, slot, innovation, H, correction):
-            return False
-    return True
+    for i in range(len(tracks)):
+        outcomes[i] = 0
+        if tracks[i] < 0:
+            continue
+        track = track_of(bank, tracks[i])
+        slots, labels, steps, window, _, _ = track
+        index = _index_of(track, stamp_ns, stack, i)
+        if index < 0:
+            continue
+        outcomes[i], count, own = 1, window[COUNT], slots[index]
+        for later in range(index, count - 1):
+            slots[later] = slots[later + 1]
+        slots[count - 1] = own
+        window[COUNT] = count - 1
+        window[NEWEST_NS] = labels[slots[count - 2], STAMP_NS]
+        for j in range(index, count - 1):
+            slot = slots[j]
+            predict_at(kind, noise, track, j, smoothing[0])
+            innovate(kind, steps[slot, 0], track, slot, innovation, H)
+            if not correct_slot(kind, track, slot, innovation, H, correction):
+                outcomes[i] = -1
+                break
 
 
 @njit(f"int64({BANK}, int64[::1], int64, {STACK})")
@@ -225,14 +251,8 @@ def find(bank: Bank, tracks: IntArray, stamp_ns: int, stack: Stack) -> int:
     n, k = bank[2].shape[3], len(stack[0])
     check_bank(tracks, 0, bank, n)
     check_stack(stack, 1, k, n)
-    if k >= bank[4].shape[2]:
-        return -1
     check_room(bank, k)
-    track = track_of(bank, tracks[0])
-    for index in range(1, track[3][COUNT]):
-        if is_same(track, track[0][index], stamp_ns, stack, 0):
-            return index
-    return -1
+    return int(_index_of(track_of(bank, tracks[0]), stamp_ns, stack, 0))
 
 
 @njit(f"int64({BANK}, int64[::1], {TIMES_NS}, {STACK})")

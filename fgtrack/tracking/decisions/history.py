@@ -158,7 +158,7 @@ class Decisions(Stateful):
         ):
             rows = step.hypotheses[number].rows
             own = rows[step.nodes.roots[rows] == root]
-            if not len(own) or step.nodes.present[own[0]] >= least:
+            if not len(own) or step.nodes.present_of(int(own[0])) >= least:
                 break
             since_ns = step.stamp_ns
         ego = None if newest.entry is None else newest.entry.scan.ego

@@ -120,6 +120,11 @@ class Nodes:
         """Probability that each track is an object of its own that exists now, shape (n,)."""
         return np.asarray(self.believed * self.alive * self.own)
 
+    def present_of(self, row: int) -> float:
+        """Return `present` of one track."""
+        own = self.probabilities[row]
+        return float(own[BELIEVED] * own[ALIVE] * own[OWN])
+
     def at(self, rows: IntArray) -> "Nodes":
         """Return a copy of the tracks in `rows`."""
         return Nodes(
