@@ -110,6 +110,9 @@ def replay(
         str(replace(draft.config, estimator=name).effective) for name in names
     ):
         say(line)
+    for name in names:
+        if line := replace(draft.config, estimator=name).revision_line:
+            say(line)
     if (
         config_file is None
         and (suited := suited_reports(draft.config.sensors)) is not None

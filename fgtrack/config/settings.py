@@ -12,7 +12,7 @@ from fgtrack.config.shipped import find_file
 from fgtrack.config.yaml_file import dump, load, plain, validate, with_settings
 from fgtrack.core.errors import CallError
 from fgtrack.core.settings import require, settings
-from fgtrack.estimation.registry import ESTIMATORS
+from fgtrack.estimation.registry import ESTIMATORS, Claims
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.evaluation.settings import EvaluationConfig
 from fgtrack.inputs.settings import InputConfig
@@ -364,6 +364,30 @@ class Config:
         return Effective(
             self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s
         )
+
+    @property
+    def revises(self) -> bool:
+        """True if late lists change decisions: not where the estimator fuses no late measurement."""
+        drops = self.estimator == "drop" or (
+            self.estimator in SMOOTHERS and self.smoother.late == "drop"
+        )
+        return (
+            isinstance(self.association, Hypotheses)
+            and self.association.revise
+            and not drops
+        )
+
+    @property
+    def revision_line(self) -> str:
+        """Line about decisions that late lists change; empty for an association that decides each list once."""
+        if not isinstance(self.association, Hypotheses):
+            return ""
+        if not self.revises:
+            return "late lists change no decision: a list older than the newest list is too old"
+        line = f"late lists change decisions for {self.effective.reach_s:g} s"
+        if Claims.of(ESTIMATORS.load(self.estimator)).is_exact:
+            return line
+        return f"{line}; {self.estimator} is not exact: its states depend on the order of arrival"
 
     def motion_model(self) -> MotionModel:
         """Return the motion model of the tracks, extended by the time-correlated errors of sensors."""

@@ -115,21 +115,9 @@ def build_tracker(
     parts = parts if observed is None else observed(parts)
     if decides:
         rules = _decision_rules(config)
-        decisions = Decisions(rules, len(config.sensors), _takes_late_lists(config))
+        decisions = Decisions(rules, len(config.sensors), config.revises)
         return DecidedTracker(parts, decisions)
     return (PublishedTracker if published_order else MultiObjectTracker)(parts)
-
-
-def _takes_late_lists(config: Config) -> bool:
-    """True if late lists change decisions: not where the estimator fuses no late measurement."""
-    drops = config.estimator == "drop" or (
-        config.estimator in SMOOTHERS and config.smoother.late == "drop"
-    )
-    return (
-        isinstance(config.association, Hypotheses)
-        and config.association.revise
-        and not drops
-    )
 
 
 def _build_facing(config: Config, cartesian: bool) -> Facing | None:

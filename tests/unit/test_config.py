@@ -83,6 +83,39 @@ def test_what_is_easily_overlooked_is_a_line() -> None:
     assert (drops.lag_s, drops.reach_s) == (1.0, 1.0)
 
 
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"association": {"kind": "mahalanobis"}}, ""),
+        ({}, "late lists change decisions for 2 s"),
+        (
+            {"estimator": "larsen"},
+            "late lists change decisions for 2 s; larsen is not exact: "
+            "its states depend on the order of arrival",
+        ),
+        (
+            {"association.revise": False},
+            "late lists change no decision: a list older than the newest list is too old",
+        ),
+        (
+            {"estimator": "drop"},
+            "late lists change no decision: a list older than the newest list is too old",
+        ),
+    ],
+)
+def test_a_line_says_whether_late_lists_change_decisions(
+    changes: dict[str, object], line: str
+) -> None:
+    config = Config.from_dict(
+        {
+            "association": {"kind": "hypotheses"},
+            "lifecycle": {"kind": "existence"},
+            "filter": {"storage_s": 2.0},
+        }
+    )
+    assert config.replace(changes).revision_line == line
+
+
 def test_a_dump_writes_every_key_out() -> None:
     text = dump(Config())
     assert [key for key in keys(Config()) if f"{key}:" not in text] == []
