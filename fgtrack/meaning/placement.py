@@ -1,6 +1,6 @@
 """Decisions on frames and mounts: from header frames and tf, from the motion of objects, from other sensors."""
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -246,8 +246,9 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     - positions of sensors are in different frames, and nothing shows which frame is the ego's;
     - the traffic past the ego is more probable for another yaw than the assumed one.
 
-    A lever arm that all sensors share is an open question, too, if nothing shows it. The
-    sensors are used as if it were 0.
+    A lever arm that nothing shows is an open question, too. If all sensors share it, they
+    are used as if it were 0. Beside sensors with another reference they are left out,
+    because one object would be at two places.
 
     Positions of a single sensor, or of sensors that agree, may be assumed in the ego's
     frame. A sensor that measures ranges and bearings may be assumed ahead if the ego
@@ -265,14 +266,27 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     shown = {name for name in _sensors(sample) if _shows_ego(sample, name, headers)}
     mounts = mounts_of(sample.messages, sample.config, shown)
     doubts = _doubts(sample, mounts, shown)
+    displaced = {
+        reference
+        for reference in mounts.references.values()
+        if reference not in shown
+        and reference not in doubts
+        and _is_arm_open(sample, mounts, reference)
+    }
+    used = _used_beside(mounts, displaced, doubts)
     for name, path in paths.items():
         if name in mounts.in_map:
             continue
+        reference = mounts.references.get(name, name)
         if name in doubts:
             question = _question(sample, name)
             yield Decision(name, "mount", {}, "open", doubts[name], question)
+        elif reference in displaced and reference != used:
+            why = f"its lever arm is unknown beside other sensors: {mounts[name].words}"
+            yield _unanswered(sample, name, why)
         elif name in mounts:
-            yield from _mount_decision(sample, mounts, name, path, shown)
+            is_provisional = reference == used
+            yield from _mount_decision(sample, mounts, name, path, is_provisional)
         elif _has_unknown_header(sample, name):
             yield _unanswered(
                 sample, name, "it has no positions that the tests can use"
@@ -433,14 +447,13 @@ def _mount_decision(
     mounts: Mounts,
     name: str,
     path: tuple[str, ...],
-    shown: Set[str],
+    is_provisional: bool,
 ) -> Iterator[Decision]:
-    """Yield the decision on the mount of one sensor."""
+    """Yield the decision on the mount of one sensor; `is_provisional` if its reference has an assumed lever arm."""
     item = mounts[name]
     reference = mounts.references.get(name, name)
     is_placed = mounts.is_placed(name)
     against = "" if reference == name else f"against {reference}: "
-    is_provisional = reference not in shown and _is_arm_open(sample, mounts, reference)
     if against and is_provisional:
         against = f"against {reference}, whose lever arm is assumed: "
     if _is_read_in_ego(sample, name):
@@ -499,6 +512,23 @@ def _is_arm_open(sample: Sample, mounts: Mounts, reference: str) -> bool:
     if item.traffic == "none" or (is_in_ego and not item.is_off):
         return False
     return not item.has_exact_arm
+
+
+def _used_beside(
+    mounts: Mounts, displaced: Set[str], doubts: Mapping[str, str]
+) -> str | None:
+    """Return the reference in `displaced` whose sensors are used: the one with most detections, if no other sensor is.
+
+    None if sensors with a known reference are used.
+    """
+    placed = set(mounts.references.values()) - displaced - set(doubts)
+    if placed or not displaced:
+        return None
+    followers = list(mounts.references.values())
+    return max(
+        sorted(displaced),
+        key=lambda name: (followers.count(name), mounts[name].num_in_tracklets),
+    )
 
 
 def _assumed_arm(

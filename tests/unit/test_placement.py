@@ -57,6 +57,25 @@ def test_a_radar_without_common_objects_is_asked_for_beside_another_sensor() -> 
     assert "input.csv.detections.front.frame" in str(found["front"].question)
 
 
+@pytest.mark.slow
+def test_a_radar_with_an_unknown_lever_arm_is_left_out_beside_another_sensor() -> None:
+    """The traffic shows its yaw, but its objects would be at other places than those of the camera."""
+    found = decisions(1, FRONT, REAR, parked=2)
+    assert found["rear"].leaves_out
+    assert "its lever arm is unknown beside other sensors" in found["rear"].reason
+    assert not found["front"].leaves_out
+
+
+@pytest.mark.slow
+def test_of_radars_with_unknown_lever_arms_those_with_most_detections_are_used() -> (
+    None
+):
+    front = replace(REAR, name="front", yaw_rad=0.0, range_m=90.0)
+    found = decisions(1, front, replace(REAR, range_m=50.0), parked=2)
+    assert found["front"].is_provisional
+    assert found["rear"].leaves_out
+
+
 def test_a_lone_radar_in_a_convoy_is_asked_for() -> None:
     found = decisions(1, Sensor("radar", half_view_rad=0.9), **CONVOY)
     assert found["radar"].certainty == "open"
@@ -153,6 +172,7 @@ def test_a_mount_against_an_assumed_lever_arm_names_the_assumption() -> None:
     assert sorted(item.certainty for item in found.values()) == ["open", "tested"]
 
 
+@pytest.mark.slow
 def test_positions_with_the_axes_of_the_ego_are_the_reference_of_turned_positions() -> (
     None
 ):

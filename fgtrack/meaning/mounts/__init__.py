@@ -22,7 +22,12 @@ from fgtrack.meaning.mounts.estimate import (
     Traffic,
 )
 from fgtrack.meaning.mounts.fit import Free, sight_errors, solved
-from fgtrack.meaning.mounts.groups import FEWEST_COMMON, Group, groups_of
+from fgtrack.meaning.mounts.groups import (
+    FEWEST_COMMON,
+    Group,
+    groups_of,
+    num_detections,
+)
 from fgtrack.meaning.mounts.pose import Pose2
 from fgtrack.meaning.mounts.reference import Reference, with_reference, yaw_of_sensor
 from fgtrack.meaning.mounts.sensor_tracks import SensorTracks, sensor_tracks
@@ -120,6 +125,7 @@ def _group_estimates(
             why,
             traffic=traffic,
             detection_std_m=sensors[name].std_m,
+            num_in_tracklets=num_detections(sensors[name]),
         )
         result.append(item.judged(assumed.get(name, Pose2())))
     return result

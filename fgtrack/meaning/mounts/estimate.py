@@ -72,6 +72,8 @@ class MountEstimate:
     """What the motion of the objects past the ego shows about the yaw of a reference."""
     detection_std_m: float = 0.0
     """Standard deviation of a detection on each axis, at the median range."""
+    num_in_tracklets: int = 0
+    """Number of detections that recur from list to list."""
 
     @property
     def pose(self) -> Pose2:
