@@ -91,7 +91,7 @@ class Draft:
         names = ", ".join(self.open_sensors)
         left_out = f"{names} left out of the runs; " if names else ""
         if provisional := ", ".join(self.provisional_sensors):
-            left_out += f"{provisional} used with an assumed lever arm; "
+            left_out += f"{provisional} used with an assumed mount; "
         questions = "; ".join(f"{item.about}: {item.question}" for item in asked)
         return f"{left_out}open: {questions}"
 

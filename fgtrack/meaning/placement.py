@@ -247,8 +247,8 @@ def mount_decisions(sample: Sample) -> Iterator[Decision]:
     - the traffic past the ego is more probable for another yaw than the assumed one.
 
     A lever arm that nothing shows is an open question, too. If all sensors share it, they
-    are used as if it were 0. Beside sensors with another reference they are left out,
-    because one object would be at two places.
+    are used as if it were 0, unless the yaw is unknown as well. Beside sensors with
+    another reference they are left out: their objects are displaced.
 
     Positions of a single sensor, or of sensors that agree, may be assumed in the ego's
     frame. A sensor that measures ranges and bearings may be assumed ahead if the ego
@@ -466,7 +466,8 @@ def _mount_decision(
                 name, "mount", {}, "assumed", reason, _question(sample, name)
             )
         return
-    if is_provisional and reference == name:
+    is_guess = not item.is_sure_of_yaw and _has_unknown_header(sample, name)
+    if is_provisional and reference == name and not is_guess:
         yield _assumed_arm(sample, item, path)
     elif item.is_off and is_placed:
         settings = _mounted_settings(sample, item, path)
@@ -536,7 +537,7 @@ def _assumed_arm(
 ) -> Decision:
     """Return the open decision on the lever arm of a reference, which is used as if the lever arm were assumed."""
     question = (
-        "all objects are displaced by the error of its assumed lever arm; "
+        "all objects are displaced by the error of its assumed mount; "
         f"{_question(sample, item.sensor)}"
     )
     settings = _mounted_settings(sample, item, path) if item.is_off else {}

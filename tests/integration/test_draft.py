@@ -307,7 +307,7 @@ def test_a_sensor_with_an_assumed_lever_arm_is_used_and_asked_again(
     draft = drafted(tables)
     assert draft.open_sensors == ()
     assert draft.config.sensors["lidar_rear"].mount == Mount()
-    assert "lidar_rear used with an assumed lever arm" in draft.problem
+    assert "lidar_rear used with an assumed mount" in draft.problem
     (tmp_path / "s.yaml").write_text(draft.to_yaml())
     again = Config.from_yaml(tmp_path / "s.yaml")
     assert list(again.sensors) == ["radar_front"]
@@ -315,7 +315,7 @@ def test_a_sensor_with_an_assumed_lever_arm_is_used_and_asked_again(
     assert "lidar_rear" not in fgtrack.advise(tables).config.sensors
     words = ["replay", str(tables), "-o", str(tmp_path / "run"), "-e", "ekf-replay"]
     assert command(words) == 1
-    assert "lidar_rear used with an assumed lever arm" in capsys.readouterr().err
+    assert "lidar_rear used with an assumed mount" in capsys.readouterr().err
     mount = {"sensors.lidar_rear.mount": {"x_m": -1.0, "y_m": 0.5}}
     assert drafted(tables, again.replace(mount)).problem is None
 

@@ -142,9 +142,7 @@ def test_traffic_shows_the_yaw_of_a_lone_radar(seed: int, parked: int) -> None:
     assert found["radar"].certainty == "open"
     assert not found["radar"].leaves_out
     assert yaw_rad(found["radar"]) == pytest.approx(0.8, abs=0.03)
-    assert "displaced by the error of its assumed lever arm" in str(
-        found["radar"].question
-    )
+    assert "displaced by the error of its assumed mount" in str(found["radar"].question)
 
 
 def yaw_rad(decision: Decision) -> float:
