@@ -23,6 +23,7 @@ from fgtrack.show.figures.style import (
     usual_step_ns,
 )
 from fgtrack.show.palette import PALETTE
+from fgtrack.show.states import groups
 
 # With more objects, all share two entries of the legend.
 _NAMED_OBJECTS = 8
@@ -186,14 +187,18 @@ def _draw_objects(
     axes: Axes, one: EvaluatedRun, tracks: Columns, window: _Window | None
 ) -> None:
     """Draw truth and tracks in the colours of the objects; without truth every track has its own colour."""
-    ids = one.run.tables["tracks"]["track_id"]
-    step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
+    every = one.run.tables["tracks"]
+    step_ns = usual_step_ns(every["now_ns"])
+    # The columns of a long table are read once, not for every track.
+    ids, stamps_ns, x_m, y_m = (
+        tracks[name] for name in ("track_id", "stamp_ns", "x_m", "y_m")
+    )
     owners = (
-        np.searchsorted(np.unique(ids), tracks["track_id"])
+        np.searchsorted(np.unique(every["track_id"]), ids)
         if one.matching is None
         else one.matching.object_index
     )
-    near = _near(tracks["stamp_ns"], window)
+    near = _near(stamps_ns, window)
     paths = () if one.matching is None else one.matching.paths
     few = len(paths) <= _NAMED_OBJECTS
     for index in (*range(max(len(paths), owners.max(initial=-1) + 1)), -1):
@@ -208,9 +213,9 @@ def _draw_objects(
                 f"object {path.object_id}" if few else "objects" if index == 0 else ""
             )
             rows = _near(path.stamps_ns, window)
-            x_m, y_m = path.states[rows, :2].T
+            true_x_m, true_y_m = path.states[rows, :2].T
             line = broken_line(
-                path.stamps_ns[rows], x_m, y_m, usual_step_ns(path.stamps_ns)
+                path.stamps_ns[rows], true_x_m, true_y_m, usual_step_ns(path.stamps_ns)
             )
             axes.plot(
                 *line,
@@ -220,9 +225,9 @@ def _draw_objects(
                 label=f"{name}, truth" if name else "",
             )
             label = f"{name}, track" if name else ""
-        mine = tracks.where(near & (owners == index))
-        for track_id in np.unique(mine["track_id"]).tolist():
-            track = mine.where(mine["track_id"] == track_id)
-            line = broken_line(track["stamp_ns"], track["x_m"], track["y_m"], step_ns)
+        mine = np.flatnonzero(near & (owners == index))
+        for _, of_track in groups(ids[mine]):
+            each = mine[of_track]
+            line = broken_line(stamps_ns[each], x_m[each], y_m[each], step_ns)
             axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
             label = ""
