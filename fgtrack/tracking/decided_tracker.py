@@ -24,8 +24,9 @@ from fgtrack.tracking.decisions.lives import DecidedLives, Life
 from fgtrack.tracking.decisions.nodes import NONE, Ended
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.facing import is_read
-from fgtrack.tracking.inbox import Batch, record
+from fgtrack.tracking.inbox import Batch, merged_records, record
 from fgtrack.tracking.list_entries import ListEntries
+from fgtrack.tracking.lives.latency import FOREVER
 from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocessed
 from fgtrack.tracking.replaced_lists import Replaced, tracks_of
@@ -418,6 +419,8 @@ class DecidedTracker(MultiObjectTracker):
         for each, own in zip(changes, named, strict=True):
             number = each.entry.number
             is_new = each.entry is entry
+            if own == self._of[number] and not replaced.is_any:
+                continue
             for position, (public, old) in enumerate(
                 zip(own, self._of[number], strict=True)
             ):
@@ -546,19 +549,19 @@ class DecidedTracker(MultiObjectTracker):
             return {}
         taken = {place.key for place in won}
         found: dict[int, list[_Place]] = {}
-        for public, stamp_ns in since.items():
-            own = [
-                place
-                for each in newer
-                if each.batch.stamp_ns >= stamp_ns
-                for position, track in enumerate(self._of[each.number])
-                if track == public
-                for place in [_Place(each, position, public)]
-                if place.key not in taken and place.key in self._fused_as
-            ]
-            if any(self._reads_states(place.entry) for place in own):
-                found[public] = own
-        return found
+        read = set[int]()
+        for each in newer:
+            number, own_ns = each.number, each.batch.stamp_ns
+            reads = self._reads_states(each)
+            for position, public in enumerate(self._of[number]):
+                if public is None or since.get(public, FOREVER) > own_ns:
+                    continue
+                key = number, position
+                if key not in taken and key in self._fused_as:
+                    found.setdefault(public, []).append(_Place(each, position, public))
+                    if reads:
+                        read.add(public)
+        return {public: own for public, own in found.items() if public in read}
 
     def _go_back(self, lost: Sequence[_Place], again_read: Sequence[_Place]) -> None:
         """Restore the beliefs about the fronts of tracks before the oldest measurement that was taken from them."""
@@ -747,8 +750,9 @@ class DecidedTracker(MultiObjectTracker):
             position, track = pairs[k]
             bank_id = states.track_ids[track]
             self._fused_as[entry.number, position] = bank_id, stack, row
-        for position, track in pairs:
-            self._tell(states.track_ids[track], entry, position)
+        if entry.is_described:
+            for position, track in pairs:
+                self._tell(states.track_ids[track], entry, position)
         if is_recorded:
             for made in records:
                 for one in made:
@@ -858,21 +862,11 @@ class DecidedTracker(MultiObjectTracker):
                 continue
             fused = self._results.get(leader)
             if fused is not None:
-                own = UpdateRecord(
-                    fused.sensor,
-                    fused.stamp_ns,
-                    fused.receipt_ns,
-                    fused.index,
-                    fused.disposition,
-                    public,
-                    fused.nis,
-                    fused.innovation,
-                    yaw=fused.yaw,
-                )
-                others = candidates.records(
-                    batch, [position], Disposition.BIRTH, public
-                )
-                self._records.append((own, *others[0][1:]))
+                if fused.track_id != public:
+                    fused = replace(fused, track_id=public)
+                merged = candidates.merged.get(leader, ())
+                others = merged_records(batch.message, merged, public) if merged else []
+                self._records.append((fused, *others))
                 continue
             disposition = Disposition.BIRTH if is_birth else Disposition.FAILED
             self._records += candidates.records(

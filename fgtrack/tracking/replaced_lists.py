@@ -31,6 +31,11 @@ class Replaced:
         self.tracks: dict[int, dict[int, int | None]] = {}
         """Former track of each detection of a list, by the number of the list and the index of the detection."""
 
+    @property
+    def is_any(self) -> bool:
+        """True if a list was replaced."""
+        return bool(self.tracks)
+
     def add(self, before: Entry, publics: Sequence[int | None], after: Entry) -> None:
         """Note that `after` has replaced `before`, whose candidates had the tracks `publics`."""
         self.tracks[after.number] = tracks_of(before, publics)
