@@ -7,6 +7,7 @@ the same for its seed and number. `make fuzz-values` takes 10,000 of such change
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ _LIVE_SHARE = 12
 _SHARES = _LIVE_SHARE * len(live.ESTIMATORS) + len(SHORT)
 
 
+@lru_cache(maxsize=1)
 def case_of(name: str, seed: int, number: int) -> tuple[dict[str, bytes], list[str]]:
     """Return the files of a case, always the same ones, and what was changed."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
@@ -103,11 +105,17 @@ def test_a_few_wrong_values_in_live_messages(
     assert list(findings_in_messages(server, name, _SEED, 40, tmp_path)) == []
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "sqlite3" else name
+        for name in SHORT  # mcap has the same messages
+    ],
+)
 def test_a_few_wrong_values_in_files_of_every_kind(
     server: Server, name: str, tmp_path: Path
 ) -> None:
-    assert case_of(name, _SEED, 1) == case_of(name, _SEED, 1)
+    assert case_of(name, _SEED, 0) == case_of.__wrapped__(name, _SEED, 0)
     assert list(findings_in_files(server, name, _SEED, 2, tmp_path)) == []
 
 

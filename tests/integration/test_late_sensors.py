@@ -172,7 +172,10 @@ def test_an_object_that_only_a_late_sensor_sees_is_one_confirmed_track(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
+@pytest.mark.parametrize(
+    "estimator",
+    ["ekf-replay", pytest.param("smoother-banded", marks=pytest.mark.slow)],
+)
 def test_so_is_each_object_of_four_sensors_with_their_own_delays(
     estimator: str,
 ) -> None:

@@ -44,6 +44,7 @@ def test_accumulated_densities_of_stone_soup_depart_with_the_lag() -> None:
     assert "covariances that are not positive definite" in found[1].sentence
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of Stone Soup
 def test_accumulated_densities_of_stone_soup_diverge_where_much_is_late() -> None:
     pytest.importorskip("stonesoup", reason="stonesoup is not installed")

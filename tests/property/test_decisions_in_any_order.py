@@ -160,7 +160,7 @@ def as_array(states: list[tuple[float, ...]]) -> FloatArray:
     return np.array(states)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_late_lists_give_the_tracks_of_a_stream_in_order(seed: int) -> None:
     lists, config = scene(seed), configuration("ekf-replay")
     in_order = outcome(lists, [0] * len(lists), config)

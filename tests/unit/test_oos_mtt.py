@@ -72,7 +72,7 @@ def test_hypotheses_lower_the_error_of_a_tracker_that_decides_at_once() -> None:
     assert totals[1] < totals[0]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_late_scans_help_a_smoother(tmp_path: Path) -> None:
     scene = scenes.draw_scene(np.random.default_rng(1), 60)
     scores = dict(oos_mtt.judged("drawn", scene, tmp_path))
