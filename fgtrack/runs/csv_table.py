@@ -133,8 +133,20 @@ def _lines(table: str, columns: Columns, is_scored: bool) -> str:
         frame["track_id"] = (
             frame["track_id"].astype("Int64").replace(NO_TRACK, pandas.NA)
         )
-    return str(
+    return _with_quoted_returns(
         frame.to_csv(
-            header=False, index=False, float_format="%.17g", lineterminator="\n"
+            header=False, index=False, float_format="%.17g", lineterminator="\r\n"
         )
     )
+
+
+def _with_quoted_returns(text: str) -> str:
+    """Return CSV text whose lines end in a line feed alone; carriage returns stay inside quotes.
+
+    pandas quotes a carriage return only where lines end in it.
+    """
+    if '"' not in text:
+        return text.replace("\r\n", "\n")
+    parts = text.split('"')
+    parts[::2] = [part.replace("\r\n", "\n") for part in parts[::2]]
+    return '"'.join(parts)

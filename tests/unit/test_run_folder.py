@@ -174,6 +174,21 @@ def test_no_name_from_a_recording_is_a_formula_in_a_spreadsheet(tmp_path):
     assert table.to_csv().endswith(",-1.5\n")
 
 
+def test_names_with_ends_of_lines_come_back(tmp_path):
+    """A carriage return alone ends a line, too, for a reader of CSV."""
+    names = ["a\rb", "\r", "a\r\nb", '"\r\n"', "a\nb", "plain", "ends\r"]
+    seen = [Detection(x_m=1.0, y_m=2.0, class_name=name, id=name) for name in names]
+    with RunWriter(tmp_path / "run") as writer:
+        writer.write_detections(DetectionList("lidar\r1", 5, 9, seen, "map"))
+        writer.write_tick(report(), 5, 2)
+        writer.finish({})
+    load_run(tmp_path / "run").save(tmp_path / "again")
+    for folder in (tmp_path / "run", tmp_path / "again"):
+        found = load_run(folder).tables["detections"]
+        assert found["class_name"].tolist() == found["id"].tolist() == names
+        assert found["sensor"].tolist() == ["lidar\r1"] * len(names)
+
+
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     with RunWriter(tmp_path / "run", config_text="seed: 1\n") as writer:
         writer.write_tick(report(), 5, 2)
