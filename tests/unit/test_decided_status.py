@@ -106,3 +106,17 @@ def test_a_confirmed_car_keeps_its_number_when_a_track_of_a_late_list_takes_over
     numbers = set(tracks["track_id"][tracks["status"] != "tentative"].tolist())
     assert run.tables["revisions"].num_rows, "no decision changes here"
     assert len(numbers) == len(cars)
+
+
+def test_a_ship_that_reports_every_three_minutes_stays_confirmed_in_between() -> None:
+    config = Config.from_yaml("ais").replace({"association": {"kind": "hypotheses"}})
+    tracker, second_ns, statuses = build_tracker(config), 1000 * MS, []
+    for k in range(541):
+        stamp_ns = k * second_ns
+        if k % 180 == 0:
+            reports = [Detection(x_m=100.0, y_m=50.0, id="1")]
+            tracker.receive(
+                DetectionList("ais", stamp_ns, stamp_ns, reports, frame="map")
+            )
+        statuses.append([each.status for each in tracker.tick(stamp_ns).tracks])
+    assert {tuple(own) for own in statuses[360:]} == {("confirmed",)}

@@ -176,8 +176,8 @@ def judged(
     """Return the tracks with their confirmation, and with the rate at which their existence decays from now on; and
     the evidence that tracks are two objects.
 
-    `nodes` is a copy, which is overwritten. `rows` are the tracks of the best hypothesis, of which other tracks may be
-    second returns.
+    A sensor that does not scan never shows that an object is hidden. `nodes` is a copy, which is overwritten.
+    `rows` are the tracks of the best hypothesis, of which other tracks may be second returns.
     """
     own, after = own_probabilities(
         nodes, rows, rules.returns, rules.speed_std_mps, before
@@ -185,7 +185,7 @@ def judged(
     kernels(_KERNELS).judge(
         nodes.probabilities,
         nodes.numbers,
-        nodes.visible,
+        np.where(rules.views.scanning, nodes.visible, 1.0),
         rules.views.of(nodes.means[:, :2], entry.scan.ego),
         own,
         rules.confirm_probability,

@@ -209,6 +209,11 @@ class Views:
         self._placing = np.array(
             [sensor.gives_position for sensor in self._sensors], dtype=bool
         )
+        self.scanning = np.array(
+            [sensor.gives_position and sensor.scan for sensor in self._sensors],
+            dtype=bool,
+        )
+        """True for each sensor whose lists show which objects are hidden, shape (sensors,)."""
         limited = [
             k
             for k, one in enumerate(self._sensors)
