@@ -27,6 +27,8 @@ from fgtrack.runs.schema import (
 
 #: Number of rows that are written together; a larger number compresses no better.
 _GROUP_ROWS = 1 << 16
+#: Largest number of batches of a few rows that are kept apart.
+_MOST_SMALL = 64
 _BLOCK_ROWS = 1 << 13
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 #: A stream of bytes for each byte of a number compresses best: neighbours share exponents, but no digits.
@@ -41,6 +43,7 @@ class ParquetTable:
         kinds = {name: column_type(name) for name in names}
         self._schema = pa.schema([(name, _TYPES[kind]) for name, kind in kinds.items()])
         self._batches: list[Any] = []  # Any: pyarrow has no types
+        self._small: list[Any] = []
         self._num_rows = 0
         self._file = pq.ParquetWriter(
             path,
@@ -86,13 +89,22 @@ class ParquetTable:
 
     def _add(self, arrays: list[Any]) -> None:
         batch = pa.record_batch(arrays, schema=self._schema)
-        self._batches.append(batch)
+        self._small.append(batch)
         self._num_rows += batch.num_rows
+        if len(self._small) >= _MOST_SMALL:
+            self._combine()
         if self._num_rows >= _GROUP_ROWS:
             self._write()
 
+    def _combine(self) -> None:
+        """Make one batch of the small batches, whose rows take seven times as much memory."""
+        rows = pa.Table.from_batches(self._small, self._schema).combine_chunks()
+        self._batches += rows.to_batches()
+        self._small = []
+
     def _write(self) -> None:
         if self._num_rows:
+            self._combine()
             rows = pa.Table.from_batches(self._batches, self._schema).combine_chunks()
             self._file.write_table(rows, row_group_size=_GROUP_ROWS)
         self._batches = []
