@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
-from fgtrack.core.linalg import kernels, stacked, symmetrise
+from fgtrack.core.linalg import kernels, stacked
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
@@ -479,33 +479,29 @@ def reaches_m(
     distance is at most `limit_m`. It is `limit_m` if the position is not measured.
     """
     squared_m2 = np.zeros(len(states.means))
+    none, P = np.zeros(len(squared_m2)), np.ascontiguousarray(states.covariances)
     for group in groups:
-        model, pose = group.stack.model, group.stack.pose
-        plain = model.components[:2] == ("x_m", "y_m")
-        if not plain or not np.array_equal(
-            model.predict(states.means, pose)[:, :2], states.means[:, :2]
-        ):
+        if not _shows_position(group, states.means):
             return np.full(len(states.means), limit_m)
-        own_m2, quantile = (
-            _largest_variances(group.stack.R).max(),
-            chi_square_quantile(probability, len(model.components)) + more_nis,
-        )
+        model, late_m2 = group.stack.model, none
         if group.stamp_error is not None:
             late = group.stamp_error.noise(
-                model, pose, states.means, states.covariances
+                model, group.stack.pose, states.means, states.covariances
             )
-            own_m2 = own_m2 + late[:, :2, :2].trace(axis1=1, axis2=2)
-        squared_m2 = np.maximum(
-            squared_m2, quantile * (_largest_variances(states.covariances) + own_m2)
+            late_m2 = late[:, :2, :2].trace(axis1=1, axis2=2)
+        quantile = chi_square_quantile(probability, len(model.components)) + more_nis
+        kernels("fgtrack.tracking.kernels").widen(
+            P, np.ascontiguousarray(group.stack.R), late_m2, quantile, squared_m2
         )
     return np.minimum(np.sqrt(squared_m2) * _MARGIN, limit_m)
 
 
-def _largest_variances(covariances: FloatArray) -> FloatArray:
-    """Return the larger eigenvalues of the position blocks of covariances (m, n, n), shape (m,)."""
-    blocks = symmetrise(covariances[:, :2, :2])
-    middle, half = (
-        0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1]),
-        0.5 * (blocks[:, 0, 0] - blocks[:, 1, 1]),
-    )
-    return np.asarray(middle + np.hypot(half, blocks[:, 0, 1]))
+def _shows_position(group: Group, means: FloatArray) -> bool:
+    """True if the first two measured components are the position in the states."""
+    model = group.stack.model
+    if model.components[:2] != ("x_m", "y_m"):
+        return False
+    if model.is_compiled:
+        return True
+    seen = model.predict(means, group.stack.pose)
+    return np.array_equal(seen[:, :2], means[:, :2])

@@ -298,6 +298,39 @@ def near(
     return rows[:count], columns[:count], distances[:count]
 
 
+@inlined
+def _largest_variance(P: FloatArray) -> float:
+    """Return the largest variance of the position in any direction."""
+    half = 0.5 * (P[0, 0] - P[1, 1])
+    across = 0.5 * (P[0, 1] + P[1, 0])
+    return float(0.5 * (P[0, 0] + P[1, 1]) + math.hypot(half, across))
+
+
+@njit(
+    "void(float64[:, :, ::1], Array(float64, 3, 'C', readonly=True), float64[:], float64, float64[::1])"
+)
+def widen(
+    P: FloatArray,
+    R: FloatArray,
+    late_m2: FloatArray,
+    quantile: float,
+    squared_m2: FloatArray,
+) -> None:
+    """Raise the squared radii (n,) of gates to those of detections with covariances R (m, k, k).
+
+    Tracks have the covariances P (n, d, d). Their positions have the further variances `late_m2` (n,). A radius is the
+    root of `quantile` times the largest variance.
+    """
+    check(P.shape[1] >= 2 and P.shape[2] >= 2 and R.shape[1] >= 2 and R.shape[2] >= 2)
+    check(len(late_m2) >= len(P) and len(squared_m2) >= len(P))
+    own_m2 = 0.0
+    for i in range(len(R)):
+        own_m2 = max(own_m2, _largest_variance(R[i]))
+    for i in range(len(P)):
+        largest_m2 = _largest_variance(P[i]) + own_m2 + late_m2[i]
+        squared_m2[i] = max(squared_m2[i], quantile * largest_m2)
+
+
 @njit("(float64[:, ::1], int64[:], int64[::1], float64)")
 def linked(
     points: FloatArray, by_x: IntArray, starts: IntArray, distance: float

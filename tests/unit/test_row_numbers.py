@@ -41,7 +41,7 @@ FURTHER_LENGTHS = {
     "arrive.mean", "correct.H", "correct.y", "distinct.pairs", "fade.probabilities", "faults.means",
     "innovations.H", "innovations.y", "judge.probabilities", "judge.scans_ns", "near.points", "update.probabilities",
     "pose_error.points", "pose_error.components", "add_pose_error.R",
-    "place.linearised1", "propagate.mean", "read.y", "turned.means",
+    "place.linearised1", "propagate.mean", "read.y", "turned.means", "widen.P", "widen.R",
 }  # fmt: skip
 HYPOTHESES: dict[str, Any] = {
     "lifecycle": {"kind": "existence"},

@@ -21,11 +21,11 @@ def log_densities(
     means: FloatArray,
     covariances: FloatArray,
 ) -> FloatArray:
-    """Return the log-densities of pairs of states and candidates, shape (p,)."""
+    """Return the log-densities of pairs of states and candidates, shape (p,); NaN if S is not definite."""
     result = np.empty(len(rows))
     for group, members, here in split(entry.groups, columns):
         result[here] = _of_group(group, members, rows.take(here), means, covariances)
-    return np.nan_to_num(result, nan=-1e300)
+    return result
 
 
 def _of_group(

@@ -8,6 +8,7 @@ import numpy as np
 
 from fgtrack.core.linalg import kernels
 from fgtrack.core.types import BoolArray, IntArray
+from fgtrack.estimation.filters.propagation import ExactPropagator
 from fgtrack.tracking.decisions.columns import (
     ALIVE,
     BELIEVED,
@@ -32,7 +33,6 @@ from fgtrack.tracking.decisions.second_returns import Evidence, own_probabilitie
 from fgtrack.tracking.decisions.unseen import Unseen, first_state
 from fgtrack.tracking.lives.existence import densities
 
-_KALMAN = "fgtrack.estimation.kernels.kalman"
 _KERNELS = "fgtrack.tracking.decisions.step_kernels"
 
 
@@ -40,8 +40,10 @@ def predicted(nodes: Nodes, dt_s: float, rules: Rules) -> Nodes:
     """Return the tracks `dt_s` later."""
     if not len(nodes) or dt_s == 0.0:
         return nodes
-    mean, F, Q = rules.motion.transition(nodes.means, np.full(len(nodes), dt_s))
-    covariances, _ = kernels(_KALMAN).predict(F, nodes.covariances, Q)
+    one_step = np.ones(len(nodes), dtype=np.int64)
+    mean, covariances = ExactPropagator(rules.motion).propagate(
+        nodes.means, nodes.covariances, one_step, dt_s
+    )
     probabilities, visible = nodes.probabilities.copy(), nodes.visible.copy()
     kernels(_KERNELS).fade(
         probabilities, visible, dt_s, rules.visible_share, rules.visible_s

@@ -67,9 +67,9 @@ def densities_of(entry: Entry, unseen: Sequence[Unseen]) -> FloatArray:
     P = np.array([each.covariance for each in unseen])
     numbers = np.array([each.number for each in unseen])
     rows, columns = np.repeat(np.arange(k), m), np.tile(np.arange(m), k)
-    found = np.exp(log_densities(entry, rows, columns, means, P)).reshape(k, m)
+    found = np.nan_to_num(np.exp(log_densities(entry, rows, columns, means, P)))
     weights = numbers * entry.sensor.detection_probability
-    return np.asarray(weights[:, None] * found)
+    return np.asarray(weights[:, None] * found.reshape(k, m))
 
 
 def first_state(

@@ -229,7 +229,8 @@ class Views:
 
         `ego` is the pose of the ego in the map. Without a pose, all objects are in view.
         """
-        views = np.tile(self._placing, (len(positions_m), 1))
+        views = np.empty((len(positions_m), len(self._placing)), dtype=bool)
+        views[:] = self._placing
         if ego is not None and len(self._limited):
             pose = np.array([[ego.x_m, ego.y_m, ego.yaw_rad]])
             kernels("fgtrack.models.view_kernels").look(
