@@ -19,10 +19,33 @@ from bench_tracker import NODE_HZ, Cell, Measured
 
 REPLAY, BACKWARD, PAPER = "ekf-replay", "ekf-backward-forward", "karle2023.yaml"
 BANDED, SMOOTHER = "smoother-banded", "smoother"
+REVISED = "ekf-replay, hypotheses"
+"""Late lists change decisions about newer lists (`association.kind: hypotheses`)."""
 REQUIRED_RATIOS = {
-    1: {REPLAY: 4.0, BACKWARD: 4.0, PAPER: 5.0, BANDED: 3.0, SMOOTHER: 1.5},
-    10: {REPLAY: 10.0, BACKWARD: 10.0, PAPER: 12.0, BANDED: 6.0, SMOOTHER: 1.0},
-    50: {REPLAY: 25.0, BACKWARD: 25.0, PAPER: 30.0, BANDED: 12.0, SMOOTHER: 1.0},
+    1: {
+        REPLAY: 4.0,
+        BACKWARD: 4.0,
+        PAPER: 5.0,
+        BANDED: 3.0,
+        SMOOTHER: 1.5,
+        REVISED: 1.5,
+    },
+    10: {
+        REPLAY: 10.0,
+        BACKWARD: 10.0,
+        PAPER: 12.0,
+        BANDED: 6.0,
+        SMOOTHER: 1.0,
+        REVISED: 8.0,
+    },
+    50: {
+        REPLAY: 25.0,
+        BACKWARD: 25.0,
+        PAPER: 30.0,
+        BANDED: 12.0,
+        SMOOTHER: 1.0,
+        REVISED: 15.0,
+    },
 }
 """Times as fast as the published implementation, by cars and row."""
 MAIN = tuple(REQUIRED_RATIOS[1])

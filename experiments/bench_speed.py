@@ -36,6 +36,7 @@ from bench_report import (
     PAPER,
     PUBLISHED_MS_PER_US,
     REPLAY,
+    REVISED,
     SMOOTHER,
     Results,
     Row,
@@ -57,13 +58,15 @@ _MANY, _SHORT_S = (
     50,
     4.0,
 )  # with more objects the traffic is shorter, or the slow ones take minutes
-_MOST = {SMOOTHER: 100}  # objects
+_MOST = {SMOOTHER: 100, REVISED: 100}  # objects
 
 
 def cell(label: str, count: int, **settings: Any) -> Cell:
     """Return the cell of a row."""
     if label == PAPER:
         return Cell(label, "karle2023", count, **settings)
+    if label == REVISED:
+        return Cell(label, "smoother", count, REPLAY, revises=True, **settings)
     return Cell(label, "smoother", count, label, **settings)
 
 

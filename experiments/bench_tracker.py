@@ -50,6 +50,8 @@ class Cell:
     duration_s: float = 8.0
     cpu: bool = False
     """Time of the processor instead of that of the clock on the wall."""
+    revises: bool = False
+    """Late lists change decisions about newer lists."""
 
     @property
     def settings(self) -> Config:
@@ -72,6 +74,11 @@ class Cell:
         own |= {"map.track": "oval", "map.pit": "oval"}
         if self.estimator is not None:
             own["estimator"] = self.estimator
+        if self.revises:
+            own |= {
+                "lifecycle": {"kind": "existence"},
+                "association": {"kind": "hypotheses"},
+            }
         return Config.from_yaml(self.config).replace(own)
 
 
