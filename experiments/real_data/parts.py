@@ -3,7 +3,7 @@
     python experiments/real_data/parts.py --autoferry AUTOFERRY --kitti KITTI -o out/parts --jobs 2
 
 `parts.csv`: MOTA and position RMSE of all recordings of a data set together, `ekf-replay`, the difference of a part off
-(of `joint`: on) from the shipped configuration with its 95 % interval, see `within_run`, and processor time.
+from the shipped configuration with its 95 % interval, see `within_run`, and processor time.
 """
 
 import csv
@@ -29,7 +29,10 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     "autoferry": {
         SHIPPED: {},
         "visibility": ALWAYS,
-        "claim": {"association.claim_m": 0.0},
+        "second returns": {
+            "sensors.lidar.second_returns": None,
+            "sensors.radar.second_returns": None,
+        },
         "jumps": {
             f"sensors.{name}.correlation.jump_probability": 0.0
             for name in ("lidar", "radar")
@@ -38,7 +41,6 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
             "sensors.lidar.correlation": None,
             "sensors.radar.correlation": None,
         },
-        "joint": {"association.joint_from": 8},
     },
     "kitti": {
         SHIPPED: {},

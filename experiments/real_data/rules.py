@@ -11,11 +11,13 @@ from scipy.stats import chi2
 from scores import scans
 
 from fgtrack import Config, FloatArray, TruthState, open_input, seconds
-from fgtrack.config import NOISE_HZ, Correlation, ExistenceRules, GatedMahalanobis
+from fgtrack.config import NOISE_HZ, Correlation, ExistenceRules
 
 #: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
 #: the hull, which the robust loss is for.
 LARGEST_JUMP = 3.0
+#: An error that differs from the last one by more than this gate is a jump.
+GATE_PROBABILITY = 0.9999
 #: At most so much of the variance lasts: something of every error is new.
 LARGEST_SHARE = 0.999
 #: Clutter is counted in discs of this radius around each false detection.
@@ -111,11 +113,7 @@ def recorded(source: Path, config: Config) -> Recorded:
 
 def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     """`config` with the numbers that `recordings` give by the rules."""
-    assert isinstance(config.association, GatedMahalanobis)
-    sensors, gate = (
-        dict(config.sensors),
-        float(chi2.ppf(config.association.gate_probability, 2)),
-    )
+    sensors, gate = dict(config.sensors), float(chi2.ppf(GATE_PROBABILITY, 2))
     for name in SENSORS:
         vessels = [vessel for one in recordings for vessel in one.seen[name]]
         hits = [
@@ -170,9 +168,6 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
         ),
         birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
         lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * max(stds_m))),
-        association=replace(
-            config.association, claim_m=_digits(math.sqrt(gate) * sum(stds_m))
-        ),
     )
 
 
@@ -319,5 +314,4 @@ def numbers(config: Config) -> dict[str, float]:
     found["lifecycle.min_travel_m"] = getattr(
         config.lifecycle, "min_travel_m", math.nan
     )
-    found["association.claim_m"] = getattr(config.association, "claim_m", math.nan)
     return found
