@@ -120,3 +120,18 @@ def test_a_ship_that_reports_every_three_minutes_stays_confirmed_in_between() ->
             )
         statuses.append([each.status for each in tracker.tick(stamp_ns).tracks])
     assert {tuple(own) for own in statuses[360:]} == {("confirmed",)}
+
+
+def test_ships_side_by_side_with_identities_of_their_own_are_tracks_of_their_own() -> (
+    None
+):
+    config = Config.from_yaml("ais").replace({"association": {"kind": "hypotheses"}})
+    tracker, owners = build_tracker(config), dict[str, set[int | None]]()
+    for k in range(24):
+        stamp_ns, name = k * 20_000 * MS, f"{k % 4}"
+        report = Detection(x_m=100.0 + 30.0 * (k % 4), y_m=50.0, id=name)
+        tracker.receive(DetectionList("ais", stamp_ns, stamp_ns, [report], frame="map"))
+        updates = tracker.tick(stamp_ns).updates
+        owners.setdefault(name, set()).update(each.track_id for each in updates)
+    assert all(len(own) == 1 for own in owners.values())
+    assert len(set.union(*owners.values())) == 4

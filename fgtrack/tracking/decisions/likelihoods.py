@@ -19,6 +19,8 @@ from fgtrack.tracking.decisions.unseen import Unseen, densities_of
 from fgtrack.tracking.objects import differ
 
 _GATE_PROBABILITY = 0.99999
+_EXCLUDING_WRONG_ID_PROBABILITY = 1e-3
+"""If wrong identities are rarer, a detection does not belong to a track with another identity."""
 _LEAST_GAIN = -LARGEST_LOSS
 _FARTHEST_M = 5000.0
 _KERNELS = "fgtrack.tracking.decisions.step_kernels"
@@ -157,7 +159,8 @@ def _described(
     """Return the log-likelihood ratio of classes and identities of each pair."""
     result = np.zeros(len(rows))
     wrong = entry.sensor.wrong_id_probability
-    weight = math.log((1.0 - wrong) / wrong)
+    same = math.log((1.0 - wrong) / wrong)
+    different = -1e300 if wrong < _EXCLUDING_WRONG_ID_PROBABILITY else -same
     own = entry.descriptions
     for k, (row, column) in enumerate(
         zip(rows.tolist(), columns.tolist(), strict=True)
@@ -169,5 +172,5 @@ def _described(
             result[k] = -1e300
             continue
         if track.ids and candidate.ids:
-            result[k] = weight if track.identity == candidate.identity else -weight
+            result[k] = same if track.identity == candidate.identity else different
     return result
