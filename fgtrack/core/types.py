@@ -332,6 +332,8 @@ class TickReport:
     smoothed: tuple[SmoothedReport, ...] = ()
     revisions: tuple[Revision, ...] = ()
     """Decisions about earlier detections that late data has changed in this tick."""
+    final_tracks: tuple["FinalTrack", ...] = ()
+    """Tracks that have ended, and that no late list can change any more; each track is in one report."""
 
     @classmethod
     def made_later(
@@ -340,6 +342,7 @@ class TickReport:
         now_ns: int,
         smoothed: Sequence[SmoothedReport],
         revisions: Sequence[Revision] = (),
+        final_tracks: Sequence["FinalTrack"] = (),
         **makers: Callable[[], Iterable[object]],
     ) -> Self:
         """Return a report with `tracks` and `updates` that their `makers` compute at the first access.
@@ -352,6 +355,7 @@ class TickReport:
             now_ns=now_ns,
             smoothed=tuple(smoothed),
             revisions=tuple(revisions),
+            final_tracks=tuple(final_tracks),
             makers=makers,
         )
         return report

@@ -226,7 +226,7 @@ def _drive(
         )
         detections_received += num_detections
         writer.write_tick(report, process_ns, num_detections)
-        writer.write_decisions(report.revisions)
+        writer.write_decisions(report.revisions, report.final_tracks)
         on_tick(report)
     if feed.last_receipt_ns is None:
         raise DataError(
@@ -235,7 +235,8 @@ def _drive(
             )
         )
     writer.write_smoothed(tracker.finish())
-    writer.write_decisions(tracker.revised(), tracker.final_tracks())
+    last = [*tracker.settled_tracks(), *tracker.final_tracks()]
+    writer.write_decisions(tracker.revised(), last)
     meta = {
         "wall_s": (perf_counter_ns() - started_ns) / NS_PER_S,
         "messages_received": feed.num_messages,

@@ -10,6 +10,7 @@ from fgtrack.config.settings import Config
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import (
     Disposition,
+    FinalTrack,
     FloatArray,
     Revision,
     TrackReport,
@@ -59,7 +60,7 @@ class Outcome:
 def outcome(scene: Scene, build: Build = build_tracker) -> Outcome:
     """Return the final tracks in a scene of the tracker that `build` makes."""
     tracker = build(Config.from_dict(scene.config))
-    records, revisions = _fed(tracker, scene)
+    records, revisions, tracks = _fed(tracker, scene)
     reports: list[tuple[int, TrackReport]] = []
     for age_s in _AGES_S:
         stamp_ns = round((scene.length_s - age_s) * NS_PER_S)
@@ -70,6 +71,7 @@ def outcome(scene: Scene, build: Build = build_tracker) -> Outcome:
         ]
     tracker.finish()
     revisions += tracker.revised()
+    tracks += [*tracker.settled_tracks(), *tracker.final_tracks()]
     assert not tracker.failures.ended
     of = _last_tracks(records, revisions)
     first: dict[int, Key] = {}
@@ -88,7 +90,7 @@ def outcome(scene: Scene, build: Build = build_tracker) -> Outcome:
     }
     return Outcome(
         states,
-        sorted(tuple(each[1:]) for each in tracker.final_tracks()),
+        sorted(tuple(each[1:]) for each in tracks),
         {key: None if i is None else first[i] for key, i in of.items()},
         statuses,
         records,
@@ -98,11 +100,12 @@ def outcome(scene: Scene, build: Build = build_tracker) -> Outcome:
 
 def _fed(
     tracker: MultiObjectTracker, scene: Scene
-) -> tuple[list[UpdateRecord], list[Revision]]:
+) -> tuple[list[UpdateRecord], list[Revision], list[FinalTrack]]:
     """Give a tracker all messages in the order of their receipt. Return its records and revisions."""
     messages = sorted(scene.messages, key=lambda each: each.receipt_ns)
     records: list[UpdateRecord] = []
     revisions: list[Revision] = []
+    tracks: list[FinalTrack] = []
     at, end_s = 0, scene.length_s + HORIZON_S - 1.0
     for tick in range(round(end_s * _TICK_HZ)):
         now_ns = tick * NS_PER_S // _TICK_HZ
@@ -112,8 +115,9 @@ def _fed(
         report = tracker.tick(now_ns)
         records += report.updates
         revisions += report.revisions
+        tracks += report.final_tracks
     assert at == len(messages)
-    return records, revisions
+    return records, revisions, tracks
 
 
 def _by_stamp(key: Key) -> tuple[int, str, int]:

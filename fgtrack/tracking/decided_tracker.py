@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from fgtrack.core.types import (
     Disposition,
@@ -23,6 +23,8 @@ from fgtrack.tracking.parts import TrackerParts
 from fgtrack.tracking.preprocess import Preprocessed
 from fgtrack.tracking.replaced_lists import Replaced, tracks_of
 
+_T = TypeVar("_T")
+_LEAST_RELEASE = 256
 _LAST_SHARE = 0.1  # of the horizon, in which an extrapolated pose becomes final
 
 
@@ -40,6 +42,8 @@ class DecidedTracker(FollowingTracker):
         "_revisions",
         "_final",
         "_ended",
+        "_settled_tracks",
+        "_next_release",
         "_unposed",
         "_lists",
         "num_revisions",
@@ -59,28 +63,53 @@ class DecidedTracker(FollowingTracker):
         self._revisions: list[Revision] = []
         self._final: dict[int, tuple[int, int]] = {}
         """First and last stamps of the detections of each track, by root."""
-        self._ended: list[Ended] = []
+        self._ended: dict[int, Ended] = {}
+        """Tracks that have ended, by root."""
+        self._settled_tracks: list[FinalTrack] = []
+        self._next_release = _LEAST_RELEASE
+        """Number of known roots at which tracks are handed out."""
 
     def revised(self) -> list[Revision]:
         """See `MultiObjectTracker.revised`."""
         found, self._revisions = self._revisions, []
         return found
 
+    def settled_tracks(self) -> list[FinalTrack]:
+        """See `MultiObjectTracker.settled_tracks`."""
+        found, self._settled_tracks = self._settled_tracks, []
+        return found
+
     def final_tracks(self) -> list[FinalTrack]:
         """See `MultiObjectTracker.final_tracks`. The tracks are in the order of their numbers."""
-        final, ended = dict(self._final), list(self._ended)
+        final, ended = dict(self._final), dict(self._ended)
         _settle(self.decisions.finished(), final, ended)
         found = [
-            FinalTrack(
-                self._public[each.root],
-                *final[each.root],
-                each.is_confirmed,
-                each.probability,
-            )
-            for each in ended
-            if each.root in self._public and each.root in final
+            _final_track(self._public[root], final[root], each)
+            for root, each in ended.items()
+            if root in self._public and root in final
         ]
         return sorted(found)
+
+    def _release(self) -> None:
+        """Hand out the tracks that no late list can change any more, and forget their numbers."""
+        if len(self._public) < self._next_release:
+            return
+        possible = self.decisions.open_roots
+        in_use = {public for publics in self._of.values() for public in publics}
+        in_use.update(self._firsts)
+        for root, public in list(self._public.items()):
+            if root in possible or public in in_use or not self._is_unknown(public):
+                continue
+            final, ended = self._final.pop(root, None), self._ended.pop(root, None)
+            if final is not None and ended is not None:
+                self._settled_tracks.append(_final_track(public, final, ended))
+            del self._public[root]
+            if self._roots.get(public) == root:
+                del self._roots[public]
+            self._shown.discard(public)
+        self._final = _known(self._final, self._public)
+        self._ended = _known(self._ended, self._public)
+        self._next_release = max(2 * len(self._public), _LEAST_RELEASE)
 
     def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
         """Decide about one list, and fuse its detections."""
@@ -132,6 +161,7 @@ class DecidedTracker(FollowingTracker):
             else:
                 self._tracks.end([bank_id])
         self._unposed = [each for each in self._unposed if each.stamp_ns >= oldest_ns]
+        self._release()
 
     def _keep_firsts(self, entry: Entry, publics: Sequence[int | None]) -> None:
         """Keep the first detections of tracks that no estimator holds, and that late data may bring back."""
@@ -514,7 +544,7 @@ class DecidedTracker(FollowingTracker):
 def _settle(
     settled: Sequence[Settled],
     final: dict[int, tuple[int, int]],
-    ended: list[Ended],
+    ended: dict[int, Ended],
 ) -> None:
     """Add decisions to the first and last stamps of tracks, and to the ended tracks."""
     for each in settled:
@@ -523,4 +553,14 @@ def _settle(
             if root != NONE:
                 first_ns, _ = final.get(root, (stamp_ns, stamp_ns))
                 final[root] = first_ns, stamp_ns
-        ended += each.ended
+        ended.update((own.root, own) for own in each.ended)
+
+
+def _known(own: Mapping[int, _T], roots: Mapping[int, int]) -> dict[int, _T]:
+    """Return the items of `own` whose roots have public numbers."""
+    return {root: each for root, each in own.items() if root in roots}
+
+
+def _final_track(public: int, final: tuple[int, int], ended: Ended) -> FinalTrack:
+    """Return a track that has ended, with its first and last stamps `final`."""
+    return FinalTrack(public, *final, ended.is_confirmed, ended.probability)

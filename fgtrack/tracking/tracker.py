@@ -207,6 +207,7 @@ class MultiObjectTracker:
             now_ns,
             smoothed,
             self.revised(),
+            self.settled_tracks(),
             tracks=tracks,
             updates=updates,
         )
@@ -247,8 +248,14 @@ class MultiObjectTracker:
         """Return the decisions that late data has changed since the last report or call. This tracker decides once."""
         return []
 
+    def settled_tracks(self) -> list[FinalTrack]:
+        """Return the tracks that have ended for good since the last report or call. This tracker has none: it decides
+        once.
+        """
+        return []
+
     def final_tracks(self) -> list[FinalTrack]:
-        """Return what each track was in the end; empty for a tracker that decides once."""
+        """Return what all other tracks were in the end; empty for a tracker that decides once."""
         return []
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:

@@ -125,6 +125,7 @@ def outcome(lists: Lists, delays_ns: Sequence[int], config: Config) -> Outcome:
     tracker = build_tracker(config)
     records: list[UpdateRecord] = []
     revisions: list[Revision] = []
+    final_tracks: list[FinalTrack] = []
     at = 0
     for tick in range(round((LENGTH_S + 2.0) * 20.0)):
         now_ns = tick * SECOND // 20
@@ -134,6 +135,7 @@ def outcome(lists: Lists, delays_ns: Sequence[int], config: Config) -> Outcome:
         report = tracker.tick(now_ns)
         records += report.updates
         revisions += report.revisions
+        final_tracks += report.final_tracks
     assert at == len(messages)
     states = sorted(
         (*each.state.mean.tolist(), *each.state.covariance.ravel().tolist())
@@ -141,7 +143,8 @@ def outcome(lists: Lists, delays_ns: Sequence[int], config: Config) -> Outcome:
         if (each.score or 0.0) > 0.02
     )
     tracker.finish()
-    return Outcome(states, tracker.final_tracks(), records, revisions)
+    final_tracks += [*tracker.settled_tracks(), *tracker.final_tracks()]
+    return Outcome(states, sorted(final_tracks), records, revisions)
 
 
 def delays(lists: Lists, seed: int, most_s: float) -> list[int]:

@@ -99,6 +99,12 @@ class Decisions(Stateful):
         return set() if step is None else set(step.nodes.roots.tolist())
 
     @property
+    def open_roots(self) -> set[int]:
+        """Tracks of all hypotheses after any list inside the horizon, and before the first one."""
+        steps = [*self._steps] if self._first is None else [self._first, *self._steps]
+        return {root for step in steps for root in step.nodes.roots.tolist()}
+
+    @property
     def entries(self) -> list[Entry]:
         """All lists inside the horizon, in the order of their stamps."""
         return [step.entry for step in self._steps if step.entry is not None]
