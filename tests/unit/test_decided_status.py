@@ -135,3 +135,16 @@ def test_ships_side_by_side_with_identities_of_their_own_are_tracks_of_their_own
         owners.setdefault(name, set()).update(each.track_id for each in updates)
     assert all(len(own) == 1 for own in owners.values())
     assert len(set.union(*owners.values())) == 4
+
+
+def test_a_report_far_away_with_the_identity_of_a_track_starts_no_other_track() -> None:
+    config = Config.from_yaml("adsb").replace({"association": {"kind": "hypotheses"}})
+    tracker, owners = build_tracker(config), set[int | None]()
+    for k in range(20):
+        stamp_ns, x_m = k * 1000 * MS, 1000.0 + 250.0 * k + (9000.0 if k == 15 else 0.0)
+        report = Detection(x_m=x_m, y_m=50.0, id="a")
+        tracker.receive(
+            DetectionList("adsb", stamp_ns, stamp_ns, [report], frame="map")
+        )
+        owners.update(each.track_id for each in tracker.tick(stamp_ns).tracks)
+    assert len(owners) == 1

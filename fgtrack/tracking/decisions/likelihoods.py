@@ -59,6 +59,8 @@ def likelihoods(
     detectable = sensor.detection_probability * nodes.visible[:, entry.index]
     shows_misses = sensor.gives_position and sensor.scan and entry.batch.last
     log_free, born = _free(entry, unseen, returns, rules)
+    if entry.is_described:
+        log_free, born = _without_owned(nodes, entry, log_free, born)
     rows, columns, densities, jumps = _pairs(nodes, entry)
     if entry.is_described:
         densities = densities + _described(nodes, entry, rows, columns)
@@ -105,6 +107,31 @@ def _free(
         shown = densities_of(entry, unseen).sum(axis=0)
         new = np.where(entry.may_start, shown, 0.0)
     return _sum_of(entry, new, 0.0 if returns is None else returns)
+
+
+def _without_owned(
+    nodes: Nodes, entry: Entry, log_free: FloatArray, born: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the result of `_free` without new objects whose identity a track has.
+
+    Such an object is new only if the identity is wrong.
+    """
+    owned: dict[str, float] = {}
+    for track, probability in zip(
+        nodes.descriptions, nodes.existed.tolist(), strict=True
+    ):
+        if track.identity is not None:
+            own = owned.get(track.identity, 0.0)
+            owned[track.identity] = max(own, probability)
+    right = 1.0 - entry.sensor.wrong_id_probability
+    shares = np.array(
+        [
+            1.0 - right * owned.get(each.identity or "", 0.0)
+            for each in entry.descriptions
+        ]
+    )
+    total = 1.0 - born + born * shares
+    return log_free + np.log(total), born * shares / total
 
 
 def _new(entry: Entry, rules: Rules) -> FloatArray:
