@@ -347,7 +347,7 @@ class FollowingTracker(MultiObjectTracker):
             position, track = pairs[k]
             bank_id = states.track_ids[track]
             self._fused_as[entry.number, position] = bank_id, stack, row
-        if entry.is_described:
+        if entry.describes:
             for position, track in pairs:
                 self._tell(states.track_ids[track], entry, position)
         if is_recorded:
@@ -357,7 +357,7 @@ class FollowingTracker(MultiObjectTracker):
 
     def _tell(self, bank_id: int, entry: Entry, position: int) -> None:
         """Let the detections of a candidate describe a track."""
-        if self._objects is not None and entry.is_described:
+        if self._objects is not None and entry.describes:
             detections = entry.candidates.described(entry.batch, position)
             self._objects.tell(bank_id, _key(entry, position), detections)
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pytest
 
 from fgtrack import (
     Config,
@@ -148,3 +149,21 @@ def test_a_report_far_away_with_the_identity_of_a_track_starts_no_other_track() 
         )
         owners.update(each.track_id for each in tracker.tick(stamp_ns).tracks)
     assert len(owners) == 1
+
+
+def test_a_track_has_the_size_of_its_detections_without_classes_and_identities() -> (
+    None
+):
+    lists = [
+        DetectionList(
+            "lidar",
+            k * PERIOD_NS,
+            k * PERIOD_NS,
+            [Detection(x_m=9.0 + 0.5 * k, y_m=0.0, length_m=4.0 + 0.1 * (k % 3))],
+            frame="map",
+        )
+        for k in range(9)
+    ]
+    [track] = published({"lidar": {"std": {"x_m": 0.3, "y_m": 0.3}}}, lists)[-1]
+    assert track.object is not None
+    assert track.object.length_m == pytest.approx(4.1)

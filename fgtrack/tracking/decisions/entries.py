@@ -204,6 +204,21 @@ class Entry:
         ]
 
     @cached_property
+    def describes(self) -> bool:
+        """True if a detection of the list has a class, an identity or a size."""
+        return any(
+            value is not None
+            for each in self.batch.message.objects
+            for value in (
+                each.class_name,
+                each.id,
+                each.length_m,
+                each.width_m,
+                each.height_m,
+            )
+        )
+
+    @cached_property
     def is_described(self) -> bool:
         """True if a candidate has a class or an identity."""
         return any(each is not NOTHING for each in self.descriptions)
