@@ -50,7 +50,7 @@ def sweep(
     everything: All = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run a grid of settings, seeds and estimators, and write one table.
+    """Run a grid of settings, seeds and estimators into one table.
 
     Prints the mean and the standard error at each point of the grid, and which
     estimators are better.
