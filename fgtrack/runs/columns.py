@@ -69,10 +69,15 @@ class MadeColumns(Columns):
     def __getitem__(self, name: str) -> Column:
         values = self._in_use.get(name)
         if values is None:
+            if name not in self._names:
+                raise KeyError(name)
             self._in_use[name] = values = read_only(self._made(name))
             if values.nbytes <= KEPT_BYTES:
                 self._columns[name] = values
         return values
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
 
     def __reduce__(self) -> tuple[type[Columns], tuple[Mapping[str, Column]]]:
         return Columns, (dict(self),)

@@ -136,8 +136,6 @@ class ParquetColumns(MadeColumns):
 
     def _made(self, name: str) -> Column:
         if name not in self._written:
-            if name not in self._names:
-                raise KeyError(name)
             return column(name, [ADDED_COLUMNS[name]] * self.num_rows)
         try:
             cells = self._file.read([name], use_threads=False).column(0)

@@ -200,3 +200,12 @@ def test_a_truth_beyond_the_last_list_stays_part_of_the_run(tmp_path):
     assert (
         len(replayed(tmp_path / "late.jsonl", tmp_path / "a", "recording").truth) == 41
     )
+
+
+def test_the_truth_of_a_recording_has_no_other_columns(tmp_path, stream):
+    truth = replayed(stream, tmp_path / "run", "recording").tables["truth"]
+    for table in (truth, truth.where(truth["object_id"] >= 0)):
+        assert "x_m" in table
+        assert "p_x_x" not in table
+        with pytest.raises(KeyError):
+            table["p_x_x"]
