@@ -410,7 +410,10 @@ def mounts_of(
 def _straight_instead(
     found: Mounts, in_ego: Sequence[str], shown: Set[str]
 ) -> list[str]:
-    """Return a sensor with the axes of the ego for each group whose reference in the ego's frame has other axes."""
+    """Return a sensor for each group whose reference has other axes than the ego.
+
+    The axes of the returned sensor are the axes of the ego.
+    """
     result = []
     for reference in in_ego:
         is_reference = found.references.get(reference) == reference
@@ -518,7 +521,9 @@ def _is_arm_open(sample: Sample, mounts: Mounts, reference: str) -> bool:
 def _used_beside(
     mounts: Mounts, displaced: Set[str], doubts: Mapping[str, str]
 ) -> str | None:
-    """Return the reference in `displaced` whose sensors are used: the one with most detections, if no other sensor is.
+    """Return the reference in `displaced` whose sensors are used; None if other sensors are used.
+
+    This is the reference with the most detections.
 
     None if sensors with a known reference are used.
     """

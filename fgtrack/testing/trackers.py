@@ -39,7 +39,7 @@ _CASES = (
 def gives_the_tracks_of_the_time_order_in_any_order(
     scene: Scene, late: Scene, build: Build
 ) -> None:
-    """Require the same tracks of a scene in order and of the same scene with late messages.
+    """Require that late messages give the tracks of the same messages in order.
 
     Compared are the track of each detection, the states of the tracks at several stamps, their status, class and
     identity, and the final tracks.

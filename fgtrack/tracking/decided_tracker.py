@@ -285,7 +285,7 @@ class DecidedTracker(FollowingTracker):
     ) -> list[Explained]:
         """Exchange the numbers of tracks if most detections of a published track now belong to an unpublished one.
 
-        Both tracks are added to `again`. Return the other lists with detections of these tracks.
+        Both tracks are added to `again`. Returned are the lists outside of `changes` with detections of these tracks.
         """
         won: dict[int, Counter[int]] = {}
         for each in changes:

@@ -48,7 +48,7 @@ class Place(NamedTuple):
 
     @property
     def detection(self) -> tuple[int, int]:
-        """Key of the detection, which all lists of the same message share."""
+        """Key of the detection: its message, and its index in the message."""
         return id(self.entry.batch.message), self.entry.candidates.leaders[
             self.position
         ]
@@ -163,7 +163,8 @@ class FollowingTracker(MultiObjectTracker):
     ) -> dict[int, list[Place]]:
         """Return the measurements that were read from states of tracks which have changed, by track.
 
-        They are newer than a measurement that the track has lost or won. Tracks in `anew` are left out.
+        Each of these measurements is newer than a measurement that its track has lost or won. Tracks in `anew` are left
+        out.
         """
         since: dict[int, int] = {}
         for place in (*lost, *won):
@@ -282,7 +283,7 @@ class FollowingTracker(MultiObjectTracker):
                     kept.append(place)
                     continue
                 self._tracks.num_measured[bank_id] -= 1
-                self._lives.doubt(bank_id)
+                self._lives.unconfirm(bank_id)
         return kept
 
     def _birth(self, place: Place, is_again: bool) -> None:

@@ -179,7 +179,7 @@ class GuardedBank(Stateful):
         return results
 
     def withdraw(self, track_ids: Sequence[int], stack: Measurement) -> list[bool]:
-        """Undo the fusion of the measurements of `stack`, one of each track.
+        """Undo the fusion of `stack`, which has a measurement of each track.
 
         Return False for a track whose estimator cannot, or does not have the measurement. A track that raises ends.
         """

@@ -316,7 +316,7 @@ def widen(
     quantile: float,
     squared_m2: FloatArray,
 ) -> None:
-    """Raise the squared radii (n,) of gates to those of detections with covariances R (m, k, k).
+    """Widen the gates of tracks, with the squared radii (n,), for detections with covariances R (m, k, k).
 
     Tracks have the covariances P (n, d, d). Their positions have the further variances `late_m2` (n,). A radius is the
     root of `quantile` times the largest variance.

@@ -16,9 +16,9 @@ _stamp = itemgetter(0)
 class StampedFacing(Facing):
     """Belief about the front of each track. It does not depend on the order of arrival.
 
-    The reading of a yaw depends on the older detections of the track, and on the shares of flipped and other wrong yaws
-    of the sensor. At each stamp, these shares are learned only from lists that are older than the stamp by more than
-    the horizon. Late lists cannot change these older lists.
+    A yaw is read with the older detections of its track, and with the shares of wrong yaws of its sensor. At each
+    stamp, these shares are learned only from lists that are older than the stamp by more than the horizon. Late lists
+    cannot change these older lists.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -34,8 +34,8 @@ class StampedFacing(Facing):
         self._horizon_ns = horizon_ns
         # Probabilities that a yaw is flipped, or wrong otherwise, by sensor and stamp, and by index of the candidate.
         self._noted: dict[tuple[str, int], dict[int, tuple[float, float]]] = {}
-        # For each sensor, stamps of the lists that are decided for good, and numbers of right, flipped and other yaws
-        # up to each list.
+        # By sensor, the stamp of each list that is decided for good. Each stamp has the numbers of right, flipped and
+        # other yaws up to this list.
         self._settled: dict[str, list[tuple[int, FloatArray]]] = {}
         self._stamp_ns = 0
 

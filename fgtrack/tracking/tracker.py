@@ -255,7 +255,7 @@ class MultiObjectTracker:
         return []
 
     def final_tracks(self) -> list[FinalTrack]:
-        """Return what all other tracks were in the end; empty for a tracker that decides once."""
+        """Return the final tracks that no report has contained; empty for a tracker that decides once."""
         return []
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:

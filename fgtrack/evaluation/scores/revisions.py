@@ -143,7 +143,7 @@ def later_states(run: Run) -> Columns:
 
 
 def _same(updates: Columns, revisions: Columns) -> tuple[IntArray, IntArray]:
-    """Return the row of each update, and the row of the update that each revision changes; -1 if there is none."""
+    """Return the row of each update, and the row of the update that each revision changes; -1 without a row."""
     n = updates.num_rows
     codes = np.zeros(n + revisions.num_rows, dtype=np.int64)
     for name in _KEY:

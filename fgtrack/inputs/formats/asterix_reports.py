@@ -190,7 +190,7 @@ def _position_m(
 def _velocity(
     record: Record, item: str, first: str, second: str
 ) -> tuple[float | None, float | None]:
-    """Return speed over ground and course; both None if not reported. The course of an object at rest is None."""
+    """Return speed over ground and course. Both are None without a report. An object at rest has no course."""
     a = record.get(f"{item}/{first}")
     b = record.get(f"{item}/{second}")
     if a is None or b is None:

@@ -98,7 +98,7 @@ class DecidedLives(Stateful):
         """True for a track that was confirmed when its life was last known."""
         return track_id in self._confirmed
 
-    def doubt(self, track_id: int) -> None:
+    def unconfirm(self, track_id: int) -> None:
         """Note that a track has lost a detection, so an earlier confirmation does not count."""
         self._confirmed.discard(track_id)
 

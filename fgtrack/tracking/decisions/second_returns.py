@@ -12,7 +12,11 @@ from fgtrack.tracking.decisions.nodes import Nodes
 from fgtrack.tracking.lives.existence import densities
 
 Evidence = Mapping[tuple[int, int], float]
-"""Greatest log-likelihood ratio so far of two objects to a hull and its second return, by the roots of both tracks."""
+"""Evidence that two tracks are two objects, by the roots of both tracks.
+
+This is a log-likelihood ratio: two objects against a hull and its second return. The greatest ratio of all
+lists counts.
+"""
 
 _HULL_STD_MPS = 0.5
 """Standard deviation of the velocity between both ends of a hull that turns."""

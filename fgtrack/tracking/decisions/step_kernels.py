@@ -211,8 +211,8 @@ def update(
             own[EXISTED] = existed * unseen_alive / (1.0 - existed * alive * missable)
             own[ALIVE] = alive * (1.0 - missable) / unseen_alive
         if is_placed[i] or not is_hit:
-            # The few hypotheses that are kept do not show each detection as clutter. So the alternative of a track with
-            # a detection is the same track without a detection.
+            # The few hypotheses that are kept do not show each detection as clutter. So a track with a detection is
+            # compared with the same track that was missed.
             exists = believed * alive
             missed = 1.0 - exists * missable
             odds = exists * detectable[i] * ratios[i] / missed if is_placed[i] else 0.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgtrack.core.linalg import kernels
 from fgtrack.core.time import seconds
-from fgtrack.core.types import BoolArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.tracking.decisions.entries import Entry
 from fgtrack.tracking.decisions.likelihoods import Table, likelihoods
 from fgtrack.tracking.decisions.nodes import (
@@ -83,9 +83,7 @@ def _explained(
         new = started(entry, births, table, unseen, views.shape[1], rules)
         every = joined(new, every)
     log_weights = ranked.gains - np.logaddexp.reduce(ranked.gains)
-    in_use, weights, parents, own_rows, row_ends, taken, gone, gone_ends = kernels(
-        _KERNELS
-    ).merge(
+    in_use, *merged = kernels(_KERNELS).merge(
         every.probabilities,
         candidates,
         members,
@@ -95,25 +93,35 @@ def _explained(
         len(entry.candidates),
         rules.least_existence,
     )
-    roots = np.append(every.roots, NONE)[taken]
-    hypotheses = tuple(
+    hypotheses = _merged(every, *merged)
+    kept = every if len(in_use) == len(every) else every.at(in_use)
+    return kept, hypotheses
+
+
+def _merged(
+    every: Nodes,
+    log_weights: FloatArray,
+    parents: IntArray,
+    rows: IntArray,
+    row_ends: IntArray,
+    taken: IntArray,
+    gone: IntArray,
+    gone_ends: IntArray,
+) -> tuple[Hypothesis, ...]:
+    """Return hypotheses from the arrays of `fgtrack.tracking.decisions.step_kernels.merge`."""
+    roots = np.append(every.roots, NONE)[taken].tolist()
+    ends = [ended(every, row) for row in gone.tolist()]
+    return tuple(
         [
             Hypothesis(
                 weight,
-                own_rows[row_ends[k] : row_ends[k + 1]],
-                tuple(roots[k].tolist()),
+                rows[row_ends[k] : row_ends[k + 1]],
+                tuple(roots[k]),
                 parent,
-                tuple(
-                    [
-                        ended(every, row)
-                        for row in gone[gone_ends[k] : gone_ends[k + 1]].tolist()
-                    ]
-                ),
+                tuple(ends[gone_ends[k] : gone_ends[k + 1]]),
             )
             for k, (weight, parent) in enumerate(
-                zip(weights.tolist(), parents.tolist(), strict=True)
+                zip(log_weights.tolist(), parents.tolist(), strict=True)
             )
         ]
     )
-    kept = every if len(in_use) == len(every) else every.at(in_use)
-    return kept, hypotheses
